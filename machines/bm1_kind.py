@@ -50,7 +50,7 @@ class BM1Kind(MachineKind):
     }
 
     def due_sections(self, parameters: BM1Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-        """Yield the prior's section, one for each column (each a MIF of the thesis), and one for any random numbers."""
+        """Yield the prior's section, one per column with a table (MIFs in the thesis), and one for an RNG's table."""
         yield "prior", "<u2", (parameters.prior_addresses, parameters.lines)
         if parameters.has_tables:
             for column, bits in enumerate(parameters.sensor_bits, start=1):
@@ -282,7 +282,10 @@ class _Course(FrameCourse):
     def proceed(
         self, reasons: Sequence[Sequence[int]], _: Sequence[memoryview]
     ) -> tuple[Sequence[int], Blocks]:
-        """With `slices`, a replica that has overflowed on one board ends on all; with `own`, there is one slice."""
+        """Return the boards that run on, and the mask of halted replicas.
+
+        With `slices`, a replica that has overflowed on one board ends on all; with `own`, there is one slice.
+        """
         over = {
             replica
             for of_board in reasons

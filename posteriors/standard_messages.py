@@ -82,7 +82,7 @@ class Plane(NamedTuple):
 
 
 def has_coordinates(dimensions: Sequence[Dimension]) -> bool:
-    """Return whether there are two searched variables, each a length, or without unit and not a mere index."""
+    """Return whether there are two searched variables: lengths, or numbers without a unit that are not mere indices."""
     return len(dimensions) == 2 and all(
         not each.states and (each.unit in _METRES or (not each.unit and (each.offset, each.step) != (0, 1)))
         for each in dimensions

@@ -28,8 +28,8 @@ def rosbayes(
 ) -> None:
     """Bayesian machines for any ROS robot.
 
-    Start with `rosbayes demo`. Each other subcommand is also a command of its own, `rosbayes hub` is `hub`, or one of
-    the toolchain: `rosbayes build` is `toolchain build`.
+    Start with `rosbayes demo`. The other subcommands also exist without `rosbayes`: `rosbayes hub` is `hub`, and
+    `rosbayes build` is `toolchain build`.
     """
 
 

@@ -127,7 +127,7 @@ class WebSocketTransport(asyncio.Protocol):
 
     @property
     def is_connected(self) -> bool:
-        """True if there is, or was, a socket."""
+        """True once there has been a socket, even after its end."""
         return self._transport is not None
 
     @property

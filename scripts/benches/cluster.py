@@ -45,7 +45,7 @@ from toolchain.errors import BuildError
 AIM: Final = 0.95
 """Efficiency that `--check` requires of two workers on two cores, against two processes without dask."""
 NETWORK: Final = "10.213.7"
-"""Of the namespaces; the scheduler's host is number 1."""
+"""First three parts of the namespaces' IPv4 addresses; the scheduler's host has the last part 1."""
 TASKS: Final = 2000
 """Number of empty tasks with which the scheduler is measured."""
 START_S: Final = 60.0

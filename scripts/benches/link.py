@@ -3,8 +3,8 @@
 bench ── blocks of 1 to 8,192 words ──▶ INPUTS of 1, 2 or 4 boards, and back
 bench ── frames of 4,096 results on 1, 2 or 4 boards, sent with the done message or read ──▶ the time besides computing
 
-What the socket takes (`none`) is part of every measurement. The rate and the latency of a modelled link are fitted to the
-difference from it, so that they come from the clock of the host and not from the model.
+The time of the socket alone (`none`) is part of every measurement. The rate and the latency of a modelled link are
+fitted to the difference from it, so that they come from the clock of the host and not from the model.
 """
 
 import argparse
@@ -56,11 +56,11 @@ Move = Callable[[Sequence[SocketLink], int], None]
 Transfers = dict[tuple[LinkRate, str, int, int], float]
 """The time (us) until a block has moved to or from each board, by link, direction, boards and size."""
 Frames = dict[tuple[LinkRate, str, int], float]
-"""The time (us) of a frame of RESULTS results besides computing, by link, way and boards."""
+"""The time (us) of a frame of RESULTS results without computing, by link, way of the results (WAYS) and boards."""
 
 
 class Fitted(NamedTuple):
-    """A rate and a latency that explain how much slower than the socket alone the transfers of a link are."""
+    """The rate and latency of a link, fitted to the time that its transfers take longer than the socket alone."""
 
     link: LinkRate
     direction: str

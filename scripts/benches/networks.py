@@ -46,10 +46,10 @@ COLUMNS: Final = (
 SEQUENCERS: Final = (Sequencer.LINEAR, Sequencer.COLOURED)
 BURN_IN: Final = 1000
 BATCHES: Final = 64
-"""Resumes of a run, whose means give the effective samples."""
+"""Number of batches of samples in a run; the batches' means give the effective samples."""
 MAX_CYCLES: Final = 2**32
 LEAVES: Final = 3
-"""The most known variables of an evidence."""
+"""Maximum number of known variables in an evidence."""
 POSSIBLE: Final = 1e-9
 """Least probability of an unlikely state, far above the rounding of exact inference."""
 

@@ -44,7 +44,7 @@ MASTER = {
 }
 """A step is over when its file exists in the folder of the measurement."""
 DEMO = {"deployment written": "deployment/deployment.toml"}
-"""The same for the demo."""
+"""The only step of the demo, and the file that ends it."""
 
 
 async def steps(folder: Path, files: Mapping[str, str], *command: str, **variables: str) -> dict[str, float]:

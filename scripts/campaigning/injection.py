@@ -28,7 +28,7 @@ class Injector:
     def __init__(
         self, stack: Stack, topology: Topology, clock: Path, publish: Callable[[str, int], Awaitable[None]]
     ) -> None:
-        """Store the file of the clock's offset, and the function that publishes special readings (kind, number)."""
+        """Store `clock`, the file with the clock's offset, and `publish`, which publishes readings (kind, number)."""
         self._stack = stack
         self._topology = topology
         self._clock = clock

@@ -34,7 +34,7 @@ class Topology(StrEnum):
     OWN = "processes"
     """The master starts services and boards; a proxy stands between them and rosbridge."""
     FUSED = "fused"
-    """The services are inside the master; otherwise as above."""
+    """As `OWN`, but the services run inside the master."""
     APART = "apart"
     """The campaign starts services and boards; proxies stand between all parts."""
     FUSED_APART = "fused, boards apart"
@@ -244,7 +244,7 @@ def used_by(pid: int) -> tuple[int, int, int]:
 
 
 def _stat(pid: int) -> list[str]:
-    """Return the fields of /proc/PID/stat from the state and the parent on; those of a zombie if the process has ended."""
+    """Return the fields of /proc/PID/stat after the name: state, parent, ...; `Z` and `0` if the process has ended."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     except OSError:

@@ -570,7 +570,7 @@ CHECKS: Final[dict[str, Check]] = {
 
 
 def bytes_of(folders: list[Path]) -> str:
-    """Return a hash of every file of the deployments."""
+    """Return one hash of all files of the deployments."""
     digest = hashlib.sha256()
     for path in sorted(path for folder in folders for path in folder.rglob("*") if path.is_file()):
         digest.update(f"{path}\0".encode() + path.read_bytes() + b"\0")

@@ -28,7 +28,7 @@ from terminal.run_directory import remove_stale_sockets
 from terminal.signals import ENDING_SIGNALS, check_signals, run_async, stopped_error
 
 _ENDING_TIME: Final = 5.0
-"""Seconds to wait at the start for boards of an earlier, killed process, which exit soon after it."""
+"""Seconds to wait at the start until the boards of an earlier, killed process have exited."""
 _STOPPING_S: Final = 2.0
 """Seconds after which a board that does not end is killed."""
 _LISTENS: Final = 128

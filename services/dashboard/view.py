@@ -66,7 +66,7 @@ class View:
         self._feed.changed()
 
     def labels(self, frame: KeptFrame) -> tuple[str, ...]:
-        """Return the labels of a frame's marginal that is shown, the vertical one first."""
+        """Return the labels of the marginal that is shown for a frame; the first is the vertical axis."""
         if self.chosen and set(self.chosen) <= set(frame.labels):
             return self.chosen
         return default_labels(frame)

@@ -38,7 +38,7 @@ _PROGRESS_EVERY = 1.0
 _DRAWN_EVERY = 0.2
 """Minimum number of seconds between two pictures, so that drawing takes little time from the frames."""
 _REASON_TIME = 5.0
-"""Seconds in which the publisher may ask the server why no result is seen."""
+"""Seconds beyond `seen_timeout` for the publisher to ask the server why no result was seen."""
 _GRACE_PERIOD = 2.0
 """Seconds in which the subscriber may report a missing reading before the master does, with more details."""
 

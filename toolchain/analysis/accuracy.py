@@ -87,7 +87,7 @@ class ZScores:
     """Counts of runs of a fixed length compared with equation 2.1: z = (n - c p) / sqrt(c p (1 - p)).
 
     Attributes:
-        cycles: The length c; a line with probability p of counting in a cycle has the count n after it.
+        cycles: The length c; n is the count after c cycles of a line that counts in a cycle with probability p.
         draws: Number of independent sequences of random numbers, over which the intervals are bootstrapped: one per
             bank of seeds, or one per reading if generators are never reset.
         rms: Root mean square of the z-scores: 1 for independent bits, 1.6 if the variance is 2.6 times as large.

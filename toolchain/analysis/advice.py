@@ -222,9 +222,10 @@ def _bm2(
 def _run_until(
     run: Callable[[int], tuple[float, float]], setting: int, accuracy: float
 ) -> tuple[int, float, float]:
-    """Return the lowest setting tried that is accurate enough, or else the most accurate; with variation and cycles.
+    """Return the best setting tried, its total variation and its cycles.
 
-    The error is inversely proportional to the square root of the setting, so every run predicts the next setting.
+    The best one is the lowest that is accurate enough, or else the most accurate. The error is inversely proportional
+    to the square root of the setting, so every run predicts the next setting.
     """
     tried: dict[int, tuple[float, float]] = {}
     while len(tried) < _ATTEMPTS and setting not in tried:

@@ -89,7 +89,7 @@ class Sampled:
 
 
 _Frame: TypeAlias = tuple[list[str], tuple[float, ...] | None]
-"""Why each board stopped; then distance, effective samples, R-hat and cycles, or None without a posterior."""
+"""The stop reason of each board; and distance, effective samples, R-hat and cycles, or None without a posterior."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -29,7 +29,7 @@ _MOST_CODES: Final = 1 << 27
 """Maximum number of codes in the tables of all CDEs, 2 bytes each."""
 
 BM2_KEYS: Final = tuple(key for key in BM2Section.model_fields if key in BM2Parameters.__dataclass_fields__)
-"""The names of the parameters that `[machine]` of `deployment.toml` has too."""
+"""The names of the BM2's parameters that are also keys of `[machine]` in `deployment.toml`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -65,7 +65,7 @@ class Quantised:
     last row is the prior without a selection, and rows of addresses that stand for no value contain 0.
     """
     tables: tuple[NDArray[np.uint16], ...]
-    """uint16[2**bits, lines] per known variable; addresses that are no value contain 0, and the top address, for
+    """uint16[2**bits, lines] per known variable. The rows of addresses without a value contain 0; the last row, for
     missing readings, contains all-ones codes. No tables with `SensorMode.THRESHOLD`.
     """
     losses: tuple[ColumnLoss, ...]
@@ -156,7 +156,7 @@ def scaled(table: NDArray[np.float64], scale: Scale) -> NDArray[np.float64]:
 
 
 def _loss(name: str, bits: int, exact: NDArray[np.float64], quantised: NDArray[np.float64]) -> ColumnLoss:
-    """Compare P(S, K) with its form from codes, both float64[values, lines]; the scale of each row does not matter."""
+    """Compare P(S, K) with the table of the codes, whose rows may have any scale; both are float64[values, lines]."""
     weight = exact.sum(axis=1)
     remaining = quantised.sum(axis=1)
     alive = (remaining > 0) & (weight > 0)

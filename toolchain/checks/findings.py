@@ -138,7 +138,7 @@ def code_findings(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def loss_findings(quantised: Quantised, options: BuildOptions) -> Iterator[Finding]:
-    """Find outlier floors that become code 0, and frames in which the true line has code 0, if these are many."""
+    """Find outlier floors (least likelihoods) that become code 0; warn if many frames have code 0 on the true line."""
     for floor in quantised.floors:
         yield warning(Check.VANISHED_FLOOR, floor.name, floor.what, floor.advice)
     mass = sum(loss.mass for loss in quantised.losses)

@@ -25,7 +25,7 @@ from toolchain.models.model import Model, cell_centres, exact_posterior
 
 _CHUNK: Final = 1 << 20
 _MOST_BITS: Final = 60
-"""Maximum surprise in bits, -log2 of the probability of the true cell; it counts for the probability 0."""
+"""Maximum surprise in bits, -log2 of the probability of the true cell; the probability 0 counts as this surprise."""
 _MOST_STATES: Final = 12
 """Maximum number of states for which a confusion matrix is shown."""
 

@@ -164,7 +164,7 @@ class Symbol:
     name: str
     """Its name, which is also the field in the message unless `path` is given."""
     type: Type
-    """Its values."""
+    """The type, which defines the symbol's values."""
     path: str = ""
     """Path of its field in the message; empty to search the message for the name."""
     bits: int = 0

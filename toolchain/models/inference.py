@@ -104,7 +104,7 @@ class _Plan:
 
 
 def _order(terms: Iterable[Term], names: set[str], sizes: Mapping[str, int]) -> tuple[str, ...]:
-    """Return the cheaper of the orders that the two rules plan, or raise a ModelError."""
+    """Return the order in which to sum out `names`: the cheaper of min-weight and min-fill; or raise a ModelError."""
     graph: _Graph = {name: set() for name in names}
     for term in terms:
         for name in term.scope:

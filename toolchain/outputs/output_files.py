@@ -85,7 +85,7 @@ foreach revision {{{" ".join(revisions)}}} {{
 
 
 class Change(StrEnum):
-    """Effect on one file of writing the files of a part."""
+    """The effect on a file when the files of its part are written."""
 
     UNCHANGED = "unchanged"
     CHANGED = "changed"
