@@ -56,6 +56,7 @@ from toolchain.outputs.output_files import (
     filter_file,
     image_files,
     memory_files,
+    present,
     quartus_files,
     text_file,
     write_files,
@@ -87,17 +88,13 @@ def build_deployment(
     """Write a deployment: `deployment.toml`, an image per board, a report, and the hardware project.
 
     The same plan gives the same bytes. A deployment in the folder is replaced. `remarks` returns sentences to
-    add to the report. A BuildError if the options contradict the register map, or the folder cannot be written.
+    add to the report. A BuildError if the options contradict the register map, if the folder cannot be written, or if
+    it has files with the names of a deployment's, but no deployment.
     """
     built = assemble(plan)
     for remark in remarks(built):
         built = replace(built, report=f"{built.report}\n{remark}\n")
-    with file_errors(directory, "written", BuildError, "; choose another folder with -o"):
-        directory.mkdir(parents=True, exist_ok=True)
-        # a process that reads the folder meanwhile finds no deployment, instead of parts of two
-        (directory / FILE_NAME).unlink(missing_ok=True)
-    write_files(
-        directory,
+    parts = (
         image_files(built.deployment, built.images),
         filter_file(built.transition),
         memory_files(built.deployment, built.images),
@@ -105,6 +102,22 @@ def build_deployment(
         text_file(REPORT_NAME, built.report),
         text_file(FILE_NAME, deployment_text(built.deployment)),
     )
+    # While it exists, the files in the folder are those of an unfinished build, which the next build may replace.
+    unfinished = directory / f"{FILE_NAME}.unfinished"
+    with file_errors(directory, "written", BuildError, "; choose another folder with -o"):
+        directory.mkdir(parents=True, exist_ok=True)
+        if (directory / FILE_NAME).is_file():
+            # a process that reads the folder meanwhile finds no deployment, instead of parts of two
+            (directory / FILE_NAME).replace(unfinished)
+        elif not unfinished.exists():
+            if foreign := [name for part in parts for name in present(directory, part)]:
+                raise BuildError(
+                    f"{directory} has {foreign[0]}, but no {FILE_NAME}: no build wrote that file, and this one would "
+                    "replace or remove it; choose another folder with -o, or move the file"
+                )
+            unfinished.touch()
+        write_files(directory, *parts)
+        unfinished.unlink()
     return replace(built, deployment=built.deployment.replace(directory=directory))
 
 

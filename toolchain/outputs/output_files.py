@@ -201,12 +201,16 @@ def compare_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change
     return sorted(changes.items())
 
 
-def _stale(directory: Path, files: OutputFiles) -> list[str]:
-    """Return the paths that an earlier build wrote for this part, and that the part no longer has."""
+def present(directory: Path, files: OutputFiles) -> list[str]:
+    """Return the paths in the folder that a build of this part replaces or removes."""
     folders = ("", "boards", PARAMETERS_FILE.partition("/")[0], MEMORIES_FOLDER)
     paths = [path for folder in folders for path in (directory / folder).glob("*")]
-    names = [path.relative_to(directory).as_posix() for path in paths]
-    return [name for name in names if files.own.fullmatch(name) and name not in files.contents]
+    return [name for path in paths if files.own.fullmatch(name := path.relative_to(directory).as_posix())]
+
+
+def _stale(directory: Path, files: OutputFiles) -> list[str]:
+    """Return the paths that an earlier build wrote for this part, and that the part no longer has."""
+    return [name for name in present(directory, files) if name not in files.contents]
 
 
 def _write(path: Path, pieces: Iterable[bytes]) -> Change:

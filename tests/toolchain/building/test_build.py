@@ -150,6 +150,24 @@ def test_a_build_over_another_leaves_nothing_of_it_even_if_it_fails_half_way(tmp
         build_model(model(), tmp_path, partitions=2)
     with pytest.raises(DeploymentError, match="deployment.toml"):
         load_deployment(tmp_path)
+    (tmp_path / "boards" / "board1.bm" / "in the way").rmdir()
+    (tmp_path / "boards" / "board1.bm").rmdir()
+    build_model(model(), tmp_path, partitions=2)
+    load_deployment(tmp_path)
+    assert sorted(path.name for path in tmp_path.glob("deployment*")) == ["deployment.toml"]
+
+
+@pytest.mark.parametrize("name", ["report.txt", "boards/board7.bm"])
+def test_a_build_leaves_files_alone_that_no_build_wrote(tmp_path, name):
+    (tmp_path / "model.py").write_text("mine")
+    (tmp_path / name).parent.mkdir(exist_ok=True)
+    (tmp_path / name).write_text("mine")
+    with pytest.raises(BuildError, match=rf"has {re.escape(name)}, but no deployment\.toml"):
+        build_model(model(), tmp_path)
+    assert (tmp_path / name).read_text() == "mine"
+    (tmp_path / name).unlink()
+    build_model(model(), tmp_path)
+    assert (tmp_path / "model.py").read_text() == "mine"
 
 
 def test_the_report_has_loss_and_warnings(tmp_path):
