@@ -44,7 +44,7 @@ def say_error(sentence: str) -> None:
 def show_progress(text: str) -> None:
     """Show the progress of this command in one line of the terminal, which the next line replaces.
 
-    In the JSON format, each progress is a separate line.
+    With JSON log lines, each call writes a line of its own.
     """
     if log_format() is LogFormat.JSON:
         say(text)

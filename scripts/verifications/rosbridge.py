@@ -160,7 +160,7 @@ class Server(Stand):
 
 
 async def settled(*clients: Ros) -> None:
-    """Wait until the server has processed earlier requests, and ROS has announced them."""
+    """Wait until the server has processed earlier requests, and ROS has announced new topics and services."""
     for ros in clients:
         with contextlib.suppress(ServiceError):
             await ros.call("/rosapi/get_time", timeout=PATIENCE)

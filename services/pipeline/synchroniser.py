@@ -35,7 +35,7 @@ class Stamped(Generic[Item]):
 
 @dataclass(slots=True)
 class _Topic(Generic[Item]):
-    """A topic: its unpaired messages, the oldest first, and its last intervals."""
+    """A topic: its unpaired messages, the oldest first, and the last intervals between its messages."""
 
     # Whether every set needs a message of this topic.
     needed: bool

@@ -39,7 +39,7 @@ _SOCKET: Final = "NOTIFY_SOCKET"
 _WATCHDOG: Final = ("WATCHDOG_USEC", "WATCHDOG_PID")
 
 GetStatus = Callable[[], ProcessStatus]
-"""Function that returns the status of a process without identity, rate, CPU time and memory, which are added here."""
+"""Function that returns the status of a process without identity, rate, CPU time and memory, which `Report` adds."""
 
 
 class ServiceManager:

@@ -178,7 +178,7 @@ class Scale(StrEnum):
     COLUMN = "column"
     """The whole table of a column."""
     NONE = "none"
-    """Nothing: the raw probabilities."""
+    """No division: the codes are those of the raw probabilities."""
 
 
 class Section(BaseModel):

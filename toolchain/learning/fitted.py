@@ -80,8 +80,7 @@ class Fit:
 def with_fit(model: Model, path: Path | None) -> Model:
     """Return a model with learnt tables instead of those set by hand, or the unchanged model without a path.
 
-    The fit must be for this model, or contain normals for a model with another grid; otherwise a ModelError
-    is raised.
+    A ModelError if the fit is for another model. Only a fit of normal distributions may be for another grid.
     """
     return model if path is None else apply_fit(model, read_fit(path), str(path))
 
