@@ -309,7 +309,7 @@ class _Course(FrameCourse):
 
 
 class _OnHost(HostMachine):
-    """Encoder of frames for each board, which checks them against the whole machine."""
+    """The host's encoder, which checks frames against the whole machine and encodes them for each board."""
 
     def __init__(self, machines: Sequence[BM1Machine]) -> None:
         # the boards differ in their lines and priors alone: what is used of the first one's parameters holds for all

@@ -34,7 +34,7 @@ def joint_posterior(
 def posterior_of_lines(
     counts: npt.NDArray[np.uint32], lines: Sequence[int], cycles: Sequence[int]
 ) -> npt.NDArray[np.float64] | None:
-    """Return the `joint_posterior` of concatenated counts, uint32[all lines], or raise a MachineError as it does."""
+    """Return the `joint_posterior` of concatenated counts, uint32[all lines], or raise its MachineError."""
     if min(cycles) <= 0:
         end = 0
         for board, (own, run) in enumerate(zip(lines, cycles, strict=True)):

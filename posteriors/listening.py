@@ -30,7 +30,7 @@ from posteriors.posterior import MAX_RESULT, RESULTS_TOPIC, RESULTS_TYPE, Poster
 from terminal.health import in_thread
 
 QUEUE_SIZE: Final = 64
-"""Default number of posteriors that wait for their reader."""
+"""Default maximum number of posteriors that wait for their reader."""
 FIRST_TIMEOUT: Final = 30.0
 """Default timeout for the first posterior, in seconds."""
 _DISORDER_NS: Final = 50_000_000

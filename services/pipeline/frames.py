@@ -167,7 +167,7 @@ class FrameAssembler:
 
     @property
     def deadline(self) -> int | None:
-        """Tick (ns) at which `due` must be called if no message completes the reading earlier; None if none waits."""
+        """Tick (ns) at which to call `due` if no message completes the reading earlier; None if no message waits."""
         return self._synchroniser.deadline
 
     def take(

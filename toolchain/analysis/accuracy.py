@@ -164,11 +164,10 @@ def measure(
     """Run a machine on readings and compare its posteriors with exact inference.
 
     A replica has the same counts as a single machine with the same bank of seeds, so a single machine is run for all
-    replicas. As many successive readings as there are replicas form a frame, which takes the cycles of the longest of
-    their runs. Without a `model`, the machine is compared only with exact inference on its codes. Readings that are
-    impossible in the model have no posterior. `advance` is called after every reading. With `own`, the filter of
-    a deployment, the readings are a sequence, each is run with one bank, and the machine is compared with the exact
-    filter.
+    replicas. `replicas` successive readings form a frame, which takes the cycles of their longest run. Without a
+    `model`, the machine is compared only with exact inference on its codes. Readings that are impossible in the model
+    have no posterior. `advance` is called after every reading. With `own`, the filter of a deployment, the readings
+    are a sequence; each is run with one bank, and its posterior is compared with that of the exact filter.
 
     Raises:
         BuildError: Fewer readings than replicas.

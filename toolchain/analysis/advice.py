@@ -54,7 +54,7 @@ class Candidate:
         total_variation: Mean distance from exact inference with this setting; 1 for a frame without a posterior.
         cycles: Median cycles of a frame.
         seconds: The time of these cycles at the clock frequency.
-        alms, blocks: Estimated logic and memory blocks of one of its boards.
+        alms, blocks: Estimated numbers of ALMs and of memory blocks on one of its boards.
         unfit: The reason why a board of this device cannot hold it; empty if it can.
     """
 

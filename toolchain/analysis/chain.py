@@ -1,10 +1,10 @@
 """The Markov chain of a BM2, exactly: its law (the distribution of its state), cycles and correlations, for few bits.
 
 In a move, a BM2 points at a bit (or several); every cycle, each CDE whose factor contains the bit draws 0 or 1, until
-all agree. With ideal random numbers, they agree on 1 in a cycle with the product of their chances of a 1, and on 0 with
-the product of the complements. This gives the matrix of a sweep, from state to state, and with it everything that long
-runs approach. The codes are those of the machine, so the effects of quantising and clipping are included. The samples
-are the states after each sweep, even if a machine takes one after every move.
+all agree. With ideal random numbers, the probability that they agree on 1 in a cycle is the product of their
+probabilities of a 1, and on 0 the product of the complements. This gives the transition matrix of a sweep, and with it
+everything that long runs approach. The codes are those of the machine, so the effects of quantising and clipping are
+included. The samples are the states after each sweep, even if a machine takes one after every move.
 """
 
 import itertools

@@ -210,7 +210,7 @@ def build_options(
 
 
 def fit_to_device(plan: "MachinePlan", name: str | None) -> tuple["MachinePlan", str]:
-    """Return the plan with enough boards of device `name` (and, for `--replicas fill`, full ones), and why."""
+    """Return the plan with enough boards of device `name` (full ones for `--replicas fill`), and sentences why."""
     if name is None:
         return plan, ""
     from toolchain.analysis.logic import device_named

@@ -375,8 +375,8 @@ def read_uai(data: bytes, builder: NetworkBuilder) -> None:
     """Read a UAI file: a preamble (kind, sizes, variables of each factor), then the numbers of each factor.
 
     The last variable of a factor varies fastest; in a BAYES file it is the child. (pyagrum 3.3.1 writes the first parent
-    fastest, contrary to the format.) pgmpy, 0.1 to 1.1, writes the same scopes with the first variable fastest and the
-    child slowest. A whole file is read in pgmpy's order if one of its tables sums to 1 in that order only.
+    fastest, contrary to the format.) pgmpy 0.1 to 1.1 lists the variables alike, but in its numbers the first variable
+    varies fastest and the child slowest. A whole file is read in this order if a table sums to 1 in this order only.
     """
     text = Scanner(data, builder.path, comments=_UAI_COMMENTS)
     kind = text.word("BAYES or MARKOV")
