@@ -1,4 +1,4 @@
-"""The parameters of a BM1 (thesis 2.1.2), and the choices and checks of the parameters of both machines."""
+"""The parameters of a BM1 (thesis 2.1.2), and the enumerations and checks that it shares with the BM2."""
 
 from dataclasses import dataclass
 from enum import StrEnum

@@ -119,7 +119,7 @@ class _Group(TyperGroup):
 
 @contextmanager
 def _noticing_closed_pipe() -> Iterator[None]:
-    """Within the context, raise a ReaderGoneError for a closed pipe, on which typer would exit with 1."""
+    """Within the context, raise a ReaderGoneError if a pipe was closed; typer itself would exit with 1."""
     try:
         yield
     except BrokenPipeError as error:

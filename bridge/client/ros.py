@@ -58,8 +58,9 @@ class Ros:
     async def close(self) -> None:
         """Close the connection after all published messages, and end everything that waits.
 
-        Some servers drop unread messages when a client disconnects. So a client that has published first
-        makes a call, whose answer follows all its messages, and waits for the answer for at most 0.3 s.
+        Some servers drop unread messages when a client disconnects. If this client has published, it therefore
+        makes a call before it disconnects, and waits for the answer, which follows all its messages, for at most
+        0.3 s.
         """
         try:
             if self._publishes and self._session.state is State.CONNECTED:

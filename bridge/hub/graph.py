@@ -17,7 +17,7 @@ from bridge.hub.outbox import Lane, Outbox
 
 @dataclass(eq=False, slots=True)
 class Client:
-    """One connected client. The keys below are the ids that the hub gives to calls and goals."""
+    """One connected client. The key of a call or a goal is the id that the hub gives it."""
 
     number: int
     """1, 2, ... in the order of connection."""

@@ -33,7 +33,7 @@ from pcie_shim.register_layout import (
 from pcie_shim.register_map import BoardState, ErrorCode
 
 CHUNK_S: Final = 0.05
-"""Duration of a chunk in seconds, after which the board reads from its host again."""
+"""Seconds that the machine runs at a time (a chunk); then the board reads from its host again."""
 
 _NO_ACCESS, _READ, _READ_WRITE = 0, 1, 3
 _SETTINGS: Final = struct.Struct(f"{SETTINGS.format}Q")  # and RUN_UNTIL

@@ -200,7 +200,7 @@ class DrivenBoard:
         self._ring(settings, blocks, _RESUME, end, 0)
 
     def _changed(self, blocks: Blocks) -> list[RegisterWrite]:
-        """Return the blocks whose contents must be written, and record them as known."""
+        """Return the writes of blocks that differ from what the board has, and record that it has them."""
         writes: list[RegisterWrite] = []
         for name, words in blocks.items():
             if self._blocks.get(name) != words:

@@ -152,7 +152,7 @@ def _fit(machines: Sequence[BM1Parameters], netlists: Sequence[Netlist]) -> None
 
 
 def _costs(relative: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the non-negative costs for which the weighted sums of the rows are nearest to 1."""
+    """Return non-negative costs, one per column, with which the sums of the rows are nearest to 1 (least squares)."""
     kept = np.full(relative.shape[1], True)
     while True:
         costs = np.zeros(len(kept))

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 Reason = TypeVar("Reason", bound=str)
 
 ANSWER_TIME = 1.0
-"""Seconds in which all processes of a run must answer."""
+"""Seconds in which a process must answer a request for its status."""
 _AT_ONCE = 256
 """Maximum number of processes asked for their status at the same time."""
 _ORDER = ("hub", "master", "subscriber", "publisher", "pcie-app")

@@ -1,4 +1,4 @@
-"""The sources of the image, with the wheels of the lock file, and time limits for this machine."""
+"""The sources of the container image, the wheels of its lock file, and time limits for this machine."""
 
 import hashlib
 import json
