@@ -301,7 +301,7 @@ class MachineKind(ABC):
 
     @abstractmethod
     def on_host(self, machines: Sequence[Any]) -> HostMachine:
-        """Return the host's view of the machines of all boards, which are in the order of the partition."""
+        """Return the host's view of all boards' machines; `machines` are in the order of the partition."""
 
     def joint_reason(self, reasons: Sequence[int]) -> int:
         """Return one stop reason for a board's replicas after a frame; without replicas, it is the only one."""

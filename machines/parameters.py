@@ -177,7 +177,7 @@ class BM1Parameters:
 
     @property
     def generator_shape(self) -> tuple[int, ...]:
-        """Shape of the generators' states: [columns], or [lines, columns] if they are not shared."""
+        """Shape of the generators' states: [columns], or [lines, columns] if each cell has its own generator."""
         return (self.columns,) if self.shared else (self.lines, self.columns)
 
     @property

@@ -96,7 +96,7 @@ def fork_command(
     kept: Collection[int] = (),
     variables: Mapping[str, str] | None = None,
 ) -> Forked:
-    """Run one of our commands in a fork of this process, which has most of its modules already.
+    """Run one of our commands in a fork of this process, which has already loaded most of the command's modules.
 
     It runs as if it had been executed: in its own session, without standard input, and with no open descriptors but
     `output` (/dev/null if None), `errors` and those in `kept`.

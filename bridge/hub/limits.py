@@ -139,7 +139,7 @@ def optional_text(operation: Operation, field: str) -> str | None:
 
 
 def flag(operation: Operation, field: str) -> bool:
-    """Return a boolean; False if it is left out."""
+    """Return a boolean field of an operation; False if the operation lacks it."""
     value = operation.get(field)
     if value is not None and not isinstance(value, bool):
         raise RefusedOperationError(f"{field} of {operation['op']} must be true or false")

@@ -119,7 +119,7 @@ class Both:
     # ---- accesses ----------------------------------------------------------------------------------------
 
     async def hardware_read(self, address: int) -> int | None:
-        """Read a word of the hardware; return None if it refuses the read."""
+        """Read a word of the hardware; return None if the hardware refuses the read."""
         answer = await self.axi.read(address, 4 - address % 4)
         if answer.resp == AxiResp.SLVERR:
             return None

@@ -162,7 +162,7 @@ class Symbol:
     """A variable: its name, its type, and, for a known variable, where its readings come from."""
 
     name: str
-    """Its name, which is also the field in the message unless `path` is given."""
+    """Name of the symbol, and of its field in the message unless `path` is given."""
     type: Type
     """The type, which defines the symbol's values."""
     path: str = ""
