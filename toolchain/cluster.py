@@ -314,7 +314,7 @@ def _client(address: str, connect: Callable[[], Any], until: float) -> Any:
 
 
 def _do(address: str, client: Any, pickled: bytes, left: dict[int, None], keep: Keep) -> None:
-    """Do the pieces of a job on the workers of one scheduler; a `_LostError` if it or all its workers are lost."""
+    """Do the pieces of a job on a scheduler's workers; a `_LostError` if the scheduler or all workers are lost."""
     from distributed import wait
 
     # Numbers that are not under way yet, in order; the numbers of each batch under way; the seconds of a piece in the

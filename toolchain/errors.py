@@ -39,11 +39,11 @@ class NotFusionError(ModelError):
 
 
 class NetworkFileError(ModelError):
-    """A network file is damaged, hostile, or of another format; the sentence contains file and line."""
+    """A network file is damaged, hostile, or of another format; the error names file and line."""
 
 
 class MifError(ToolchainError):
-    """A memory file cannot be read: not a MIF, or words that don't fit; the sentence contains file and line."""
+    """A memory file is not a MIF, or its words do not fit the memory; the error names file and line."""
 
 
 class BuildError(ToolchainError):

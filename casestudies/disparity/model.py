@@ -19,7 +19,7 @@ TRUTH_TOPIC: Final = "/stereo/true_disparity"
 DISPARITY_TOPIC: Final = "/stereo/disparity"
 TILE_TOPIC: Final = "/disparity/likelihoods"
 TILE_TYPE: Final = "disparity_msgs/Likelihoods"
-"""A header, and a `uint8[]` named after each filter: a likelihood per pixel and disparity; the largest is 255."""
+"""Fields: a header, and a `uint8[]` named after each filter, with likelihoods per pixel and disparity, at most 255."""
 
 _COSTS: Final = 64
 """Number of costs in the tables, which are only for the model: a machine that gets likelihoods has no tables."""

@@ -188,7 +188,7 @@ async def check_passes(stand: Server, sent: Any, type_name: str = ARRAY, **optio
 
 @contextlib.contextmanager
 def failing(error: type[Exception], otherwise: str, naming: str = "") -> Iterator[None]:
-    """Check that the block raises this error, with `naming` in its text."""
+    """Check that the block raises this error, with `naming` in its text; without an error, fail with `otherwise`."""
     try:
         yield
     except error as raised:

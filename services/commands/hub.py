@@ -106,7 +106,7 @@ def access_policy(
     insecure: bool,
     danger: str,
 ) -> AccessPolicy:
-    """Return the access policy of the flags; `files` (certificate, key, tokens) are needed if others can connect."""
+    """Return the access policy of the flags; a `host` beyond loopback needs `files`: certificate, key, tokens."""
     certificate, key, tokens = files
     if (certificate is None) != (key is None):
         raise SettingsError(

@@ -42,7 +42,7 @@ class LineBoard(msgspec.Struct, omit_defaults=True):
 
 
 class LineResult(msgspec.Struct, kw_only=True):
-    """A result with its reading: from `pcie-app` to `publisher`. A reading that is an array has the one address -1."""
+    """A result with its reading: from `pcie-app` to `publisher`. A reading that is an array has the address -1."""
 
     number: _Unsigned
     stamp_ns: int | None = None

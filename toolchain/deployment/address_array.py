@@ -89,7 +89,7 @@ def to_addresses(deployment: Deployment, variable: Variable, value: object) -> l
     has `MISSING` on all lines.
 
     Raises:
-        ReadingError: The array has another length, or contains an unusable reading, which the sentence names.
+        ReadingError: The array has another length, or contains an unusable reading, which the error names.
     """
     machine = deployment.machine
     shape = deployment.reading_shape(variable)

@@ -149,7 +149,7 @@ class Question:
     known: tuple[Symbol, ...]
     """The known symbols, in the columns' order."""
     given: Mapping[str, int]
-    """The index of each fixed value, by its symbol's name."""
+    """For each symbol that the question fixes, by name, the index of its value."""
     prior_select: Symbol | None
     """The symbol that selects the prior, or None."""
     previous: tuple[Symbol, ...] = ()

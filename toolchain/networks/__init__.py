@@ -41,8 +41,7 @@ def read_network(path: Path, *, on_missing: Literal["error", "missing"] = "error
     """Return the joint distribution in a network file; its name ends in one of `SUFFIXES`, and `.gz` may follow.
 
     Raises:
-        NetworkFileError: The file is missing, too large, or not a network; the sentence contains file and
-            line.
+        NetworkFileError: The file is missing, too large, or not a network; the error names file and line.
     """
     from toolchain.networks.builder import NetworkBuilder
 

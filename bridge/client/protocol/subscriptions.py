@@ -263,7 +263,7 @@ class Subscriptions:
         return bool(waiting)
 
     def silent(self) -> list[str]:
-        """Return the topics subscribed to with a type that have had no message on this connection."""
+        """Return the topics that were subscribed to with a type and have had no message on this connection."""
         return [
             s.topic
             for s in self._subscribed.values()
