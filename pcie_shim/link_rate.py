@@ -2,9 +2,9 @@
 
     frame ──▶ waits until the wire is free ──▶ occupies it for bits / rate ──▶ latency ──▶ arrives
 
-The board's side delays the frames that it receives and those that it sends. It really waits, in addition to the time
-that the socket takes. The delay changes no counts, and is not in COMPUTE_NS. Programming has its own port, which is
-not delayed.
+The board's side delays the frames that it receives and those that it sends. This delay is a real wait, in addition to
+the time that the socket takes. The delay changes no counts, and is not in COMPUTE_NS. Programming has its own port,
+which is not delayed.
 """
 
 import fcntl

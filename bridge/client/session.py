@@ -242,7 +242,7 @@ class Session:
                 return
 
     async def close(self, reason: str = "closed by this client") -> None:
-        """Close the connection after all sent messages, and end everything that waits."""
+        """Close the connection once all sent messages are written, and end every wait for a message or an answer."""
         self.check_thread()
         if self.state is State.CLOSED:
             return

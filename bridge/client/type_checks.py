@@ -30,7 +30,7 @@ _Part = Literal["service_request", "service_response", "action_goal", "action_re
 
 
 class TypeChecks:
-    """The checks of what one client sends. If rosapi does not answer, it is not asked again on the same connection."""
+    """The type checks of the data that one client sends. A rosapi that does not answer is asked once per connection."""
 
     def __init__(self, session: Session) -> None:
         self._session = session

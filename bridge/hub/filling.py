@@ -8,8 +8,8 @@ says (ROSBRIDGE_PROTOCOL.md, 3.3.3). Unlike the reference server, the hub does n
     {"op":"publish","topic":"/t","msg":{"data":[1.5]}}                                     as received
     {"op":"publish","topic":"/t","msg":{"data":[1.5],"layout":{"dim":[],"data_offset":0}}} as forwarded
 
-A message that only lacks outermost fields, as most do, keeps its own JSON: the JSON of these fields, its *tail*, takes
-the place of the last two braces. Only a message with an incomplete part is written again.
+Most messages lack only outermost fields. Such a message keeps its own JSON: the JSON of the absent fields, its *tail*,
+replaces the last two braces. Only a message in which a nested message lacks fields is written again.
 """
 
 from collections.abc import Callable

@@ -344,7 +344,7 @@ class Session:
         return drawn
 
     async def write_settings(self) -> None:
-        """Write target, limits and bank, often so that two stop reasons occur in the same cycle."""
+        """Write target, limits and bank, often chosen so that two stop reasons occur in the same cycle."""
         p, both = self.parameters, self.both
         target = int(
             self.random.choice(
@@ -510,7 +510,7 @@ class Session:
         return False
 
     async def reset_while_running(self, left: int, number: int) -> None:
-        """Reset at any clock of the frame, or just after its end."""
+        """Reset both boards at a random clock cycle of a frame, or just after its end."""
         both = self.both
         while not both.board.running and both.dut.running.value == 1:
             await RisingEdge(both.dut.clk_i)  # a frame of one cycle or none, while its seeds are loaded

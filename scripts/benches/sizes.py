@@ -56,7 +56,7 @@ class Point(NamedTuple):
     link_bytes: float
     cycle_us: float
     parts_us: dict[str, float]
-    """By the names of PARTS."""
+    """Times in microseconds, by the names in `PARTS`."""
     lost: int
     """Frames without a posterior, of those whose stages were measured."""
 

@@ -114,7 +114,7 @@ def _reasons(fault: Fault, topology: Topology) -> set[str]:
 
 
 def excuses_of(step: Step, topology: Topology, until: float = 0.0) -> Excuses:
-    """Return the losses that a step explains, both counted ones and those of messages between processes."""
+    """Return the losses that a step explains: those that the stack counts, and those of messages between processes."""
     reasons: set[str] = set()
     readings = results = False
     for fault in step:

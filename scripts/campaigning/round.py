@@ -4,8 +4,8 @@
                                         └──────────────────────────────────────────────────────┘
 
 `recover` waits for the result of a reading that is published after the fault. `settle` waits until nothing is in
-flight, and then judges the counters. `calm` requires results while there is no fault, and then settles without
-excuses.
+flight, and then judges the counters. `calm` requires results while there is no fault, and then settles in a way that
+excuses no loss.
 """
 
 import asyncio

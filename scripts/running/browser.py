@@ -143,7 +143,7 @@ class Visit:
         return float(await self.page.evaluate("window.moved"))
 
     async def mean_near(self, to: Place) -> float:
-        """Wait until a posterior with its mean near `to` is painted after a drag; return the browser's time."""
+        """Wait until a posterior with its mean near `to` is painted after a drag; return its browser time."""
         found = await self.until(
             """([x, y, near]) => {
                 const {clientWidth, clientHeight} = document.querySelector('[data-testid=posterior]');

@@ -48,7 +48,7 @@ _MAX_LANDMARKS: Final = 100
 _MAX_SWITCHES: Final = 100
 _MAX_NAME: Final = 100
 _MAX_WARNINGS: Final = 20
-"""Maximum number of warnings about unreadable messages. Each reason is reported once; there may be thousands."""
+"""Maximum number of warnings about unreadable messages. Each reason is reported once; reasons may be numerous."""
 _QUEUE_SIZE: Final = 64
 
 

@@ -57,7 +57,7 @@ class ModelFlags:
     )
 
     def over(self, built: ModelSection) -> "ModelFlags":
-        """Return these flags, and for those that are not set the values in `built`, the `[model]` of a deployment."""
+        """Return these flags; flags that are not set get the values in `built`, the `[model]` of a deployment."""
         found = {
             each.name: getattr(self if getattr(self, each.name) != each.default else built, each.name)
             for each in fields(ModelFlags)

@@ -119,7 +119,7 @@ def apply_fit(model: Model, fit: Fit, where: str = "the fit") -> Model:
 def cell_spread(model: Model, known: Known) -> NDArray[np.float64]:
     """Return the standard deviation of a variable's mean within the cell of each line: float64[lines].
 
-    The searched values are uniform in a cell, and the mean is assumed linear in it.
+    The searched values are assumed uniform within a cell, and the mean linear.
     """
     slopes = mean_slopes(model, known)
     spread: NDArray[np.float64] = np.sqrt((slopes**2).sum(axis=0) / 12)

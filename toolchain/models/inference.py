@@ -195,7 +195,7 @@ def _check_size(scope: Sequence[str], sizes: Mapping[str, int], what: str) -> No
 _LONGEST_DRAWN: Final = 12
 """Maximum number of symbols in a path that is shown completely."""
 _SHOWN: Final = 4
-"""Number of arcs shown at either end of a longer path."""
+"""Number of arcs shown at each end of a path that is shortened."""
 
 
 class Links:

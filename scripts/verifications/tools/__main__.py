@@ -1,4 +1,4 @@
-"""Verification of the topics for robot tools with tools of others: Foxglove's readers and rviz (see scripts/verify).
+"""Verification of the topics for robot tools with other projects' tools: Foxglove's readers, rviz (see scripts/verify).
 
 boat-simulator --> boat-normaliser --> hub <--> master with 4 boards
                                         |--JSON, cbor-raw--> Foxglove's client and readers, on Node (foxglove.mjs)
