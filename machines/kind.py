@@ -304,7 +304,7 @@ class MachineKind(ABC):
         """Return the host's view of all boards' machines; `machines` are in the order of the partition."""
 
     def joint_reason(self, reasons: Sequence[int]) -> int:
-        """Return one stop reason for a board's replicas after a frame; without replicas, it is the only one."""
+        """Return one stop reason for a board's replicas after a frame; without replicas, the machine's own."""
         return reasons[0]
 
     @abstractmethod

@@ -24,7 +24,7 @@ MOST_NUMBERS: Final = 1 << 26
 _EVERY: Final = 5.0
 """Minimum number of seconds between two writes of an archive."""
 _SHARE: Final = 20
-"""Writing an archive takes at most 1 / `_SHARE` of the time."""
+"""Minimum ratio of the pause after writing an archive to the duration of the writing."""
 _NOT_KNOWN: Final = -1
 
 
