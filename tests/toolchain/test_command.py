@@ -159,6 +159,13 @@ def test_a_missing_model_is_named_before_a_missing_target(tmp_path, name):
     assert_refused(build(tmp_path / name, target=()), str(tmp_path / name))
 
 
+def test_check_names_what_a_path_lacks(tmp_path):
+    assert_refused(
+        toolchain("check", tmp_path), tmp_path, "contains no model or deployment", "deployment.toml"
+    )
+    assert_refused(toolchain("check", tmp_path / "new"), tmp_path / "new", "does not exist", "model.py")
+
+
 @pytest.mark.parametrize("at", [0, 2, 4], ids=TARGET[::2])
 def test_a_target_with_a_part_missing(case, at):
     assert_refused(build(case, target=TARGET[:at] + TARGET[at + 2 :]), f"{TARGET[at]} is missing")

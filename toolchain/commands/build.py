@@ -125,9 +125,10 @@ def check(
     elif is_network(checked) or case_study.model_path(checked).is_file():
         findings = _of_model(checked, flags, target, sources)
     else:
+        found = "contains no model or deployment" if checked.exists() else "does not exist"
         raise BuildError(
-            f"{checked} contains neither a model ({case_study.FILE_NAME}) nor a deployment ({FILE_NAME}), and is not a "
-            "network's file"
+            f"{checked} {found}; expected the folder of a model ({case_study.FILE_NAME}) or of a deployment "
+            f"({FILE_NAME}), or a network's file"
         )
     for finding in findings:
         typer.echo(json_text.dumps(asdict(finding)) if json else finding.sentence)
