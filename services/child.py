@@ -128,7 +128,7 @@ class Child:
         self.restarts = 0
 
     async def start(self) -> None:
-        """Start the child in its own session, where no Ctrl-C reaches it; a StackError if the command is not installed."""
+        """Start the child in its own session, where no Ctrl-C reaches it; a StackError if its command is missing."""
         self.close()
         self._error = ""
         lines, reports = self._pipes = [_Pipe(lambda line: relay(line, self.name)), _Pipe(self._take_report)]
