@@ -254,7 +254,7 @@ class WebSocketTransport(asyncio.Protocol):
         self._read_turn(data, at)
 
     def eof_received(self) -> None:
-        """End the whole connection when the peer ends its half."""
+        """End the connection in both directions when the peer has ended its own direction."""
         self._receive_eof()
         self._flush()
 

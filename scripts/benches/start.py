@@ -92,7 +92,7 @@ def show(title: str, rounds: list[dict[str, float]]) -> None:
 
 
 async def bench(arguments: argparse.Namespace) -> int:
-    """Measure the demo, then `master --once` with compiled kernels, and once without."""
+    """Measure the demo, then `master --once` with compiled kernels, then one run that compiles them."""
     async with temporary_stand() as stand:
         rounds = []
         for at in range(arguments.rounds):

@@ -1,4 +1,4 @@
-"""The cycle with a subscriber and a publisher started for each message, as probably in the thesis, and started once.
+"""The cycle if subscriber and publisher start for each message (probably as in the thesis), and if they start once.
 
 client --reading--> hub --> subscriber -> master -> pcie-app -> 4 boards -> pcie-app -> master -> publisher --> hub --> client
                             `-- started for each message, or once ------------------------------'
