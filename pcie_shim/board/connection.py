@@ -150,7 +150,7 @@ class Connection:
 
 
 class HostConnection(Connection):
-    """A link to a host, which holds the board after its first request."""
+    """A link to a host; after its first request, the host holds the board."""
 
     def __init__(
         self,

@@ -264,7 +264,7 @@ def show(transfers: Transfers, frames: Frames, fitted: Sequence[Fitted]) -> None
 
 
 def draw(path: Path, transfers: Transfers, frames: Frames) -> None:
-    """Draw the time of a read by its size, with the link model's own time dotted, and of a frame by partitions."""
+    """Draw the time of a read by its size (dotted: the link model's own time), and of a frame by number of boards."""
     figure = new_figure(9.6, 4.2)
     by_size, by_boards = figure.subplots(1, 2)
     for link, colour in zip(LinkRate, ("#bbbbbb", "#4477aa", "#ee6677"), strict=True):

@@ -58,7 +58,7 @@ Marginals: TypeAlias = Mapping[int, NDArray[np.float64]]
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """A network as our toolchain and as pyagrum read it. Its variables have the numbers of the machine."""
+    """A network as our toolchain and as pyagrum read it. Its variables are numbered as in the machine."""
 
     model: NetworkModel
     zeros: int

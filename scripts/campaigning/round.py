@@ -75,7 +75,7 @@ class Round:
         *,
         calm_frames: int,
     ) -> None:
-        """Store an empty folder, and the number of frames to compute between two steps."""
+        """Store the arguments: `folder` is empty, and `calm_frames` are computed between two steps."""
         self._rng, self._topology, self._calm_frames = rng, topology, calm_frames
         self.stack = Stack(folder, topology, deployment, rng)
         self.observer = Observer(expected)
@@ -233,7 +233,7 @@ class Round:
         self._paused = False
 
     async def _calm(self) -> None:
-        """Compute frames without faults, check that no loss needs a fault as its reason, and sample the resources."""
+        """Compute frames without faults, check that no loss occurs that only a fault explains, and sample resources."""
         observer = self.observer
         observer.calm()
         wanted = observer.results + self._calm_frames

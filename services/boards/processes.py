@@ -236,7 +236,7 @@ class BoardProcesses:
         say(f"board 0 listens at {first}" if count == 1 else f"{count} boards listen at {first} ... {last}")
 
     def _report(self) -> None:
-        """Tell the service manager how many boards listen, and whether none of them is stuck."""
+        """Tell the service manager how many boards listen, and whether all of them make progress."""
         # a board without a sign so far counts from its start
         count, now = len(self._endpoints), time.monotonic()
         self._manager.report(

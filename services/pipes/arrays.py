@@ -155,7 +155,7 @@ def array_field(definitions: Definitions, message_type: str, path: str | None) -
 
 
 async def _definitions(ros: Ros, message_type: str) -> Definitions:
-    """Return the fields of a type from its name, from rosapi or from rosbags; empty if none of them knows it."""
+    """Return the fields of a type, from rosapi or rosbags (empty if unknown), or of a std_msgs array from its name."""
     name = ros1_type(message_type)
     if match := _MULTI_ARRAY.fullmatch(name):
         return {name: {"data": FieldType(match[1].lower(), 0)}}

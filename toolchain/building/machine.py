@@ -33,7 +33,7 @@ MACHINE_KEYS: Final = tuple(
 
 
 def machine_options(source: BuildOptions | MachineSection, keys: Iterable[str]) -> dict[str, Any]:
-    """Return the values of `keys` in `source`, without those that no build option sets and those that are None."""
+    """Return the values of `keys` in `source`, except keys that no build option sets and values that are None."""
     options = [key for key in keys if key in BuildOptions.__dataclass_fields__]
     return {key: value for key in options if (value := getattr(source, key)) is not None}
 

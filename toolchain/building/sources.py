@@ -16,7 +16,7 @@ MOST_SOURCES: Final = 256
 
 
 class SourceTable(Source):
-    """A `[[source]]` of a sources file, a topic with its variables; without a `uri`, that of `--uri` is used."""
+    """A `[[source]]` of a sources file: a topic with its variables. If it has no `uri`, `--uri` applies."""
 
     variables: dict[Name, MessagePath] | None = None
     """The path of each variable in the message, by name; None for all variables that no other source has."""

@@ -31,7 +31,7 @@ _LARGE_ERROR: Final = 0.01
 _STATE_BITS: Final = 20
 """Maximum number of bits of a state for the check whether all states are connected."""
 _PATTERN_BITS: Final = 24
-"""Maximum number of a state's bits plus known variables that may be missing, for the check whether states connect."""
+"""Maximum number of state bits and optional known variables together, up to which connections of states are checked."""
 _BLANKET_BITS: Final = 16
 """Maximum number of bits that share a factor with one bit; the search for opposite clips tries all their values."""
 _RELATED_BITS: Final = 2048
