@@ -26,7 +26,7 @@ class BadImageError(Exception):
 
 
 def read_image(message: Mapping[str, Any], *encodings: str) -> NDArray[Any]:
-    """Return a sensor_msgs/Image as an array [height, width], or raise a BadImageError; `encodings` are those allowed."""
+    """Return a sensor_msgs/Image in one of `encodings` as an array [height, width], or raise a BadImageError."""
     encoding = message.get("encoding")
     if encoding not in encodings:
         raise BadImageError(f"its encoding is {str(encoding)[:20]!r}, expected {' or '.join(encodings)}")
