@@ -127,7 +127,9 @@ def _listening(directory: str | os.PathLike[str] | None, name: str) -> Iterator[
         except OSError as error:
             from terminal.output import warn
 
-            reason = "another process listens there" if error.errno == errno.EADDRINUSE else error.strerror
+            reason = error.strerror
+            if error.errno == errno.EADDRINUSE:
+                reason = "another process listens there; give this one another directory with BM_RUN_DIRECTORY"
             warn(f"its status cannot be shown at {path}: {reason or error}", name=name)
     try:
         yield listener
