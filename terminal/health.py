@@ -129,7 +129,7 @@ def _listening(directory: str | os.PathLike[str] | None, name: str) -> Iterator[
 
             reason = error.strerror
             if error.errno == errno.EADDRINUSE:
-                reason = "another process listens there; give this one another directory with BM_RUN_DIRECTORY"
+                reason = "another process listens there; give this one its own directory (BM_RUN_DIRECTORY)"
             warn(f"its status cannot be shown at {path}: {reason or error}", name=name)
     try:
         yield listener
