@@ -10,7 +10,7 @@ _KEYS: Final = (("sec", "nanosec", 2), ("secs", "nsecs", 1))
 
 
 def stamp(time_ns: int, ros_version: Literal[1, 2] | None = None) -> dict[str, int]:
-    """Return nanoseconds since 1970 as a `stamp` with the keys of a ROS version, or for None with the keys of both."""
+    """Return nanoseconds since 1970 as a `stamp` with the keys of one ROS version, or of both if it is None."""
     seconds, nanoseconds = divmod(time_ns, _NS)
     time: dict[str, int] = {}
     for second, nanosecond, version in _KEYS:

@@ -409,7 +409,7 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
 def _less_in_lanes(
     builder: Any, numbers: Any, row: Any, places: Any, lane: Any, codes: Any, base: Any, own: Any, first: Any
 ) -> Any:
-    """Compare a chunk with a code for each of 8 chains, at each chain's place in `numbers`, as `less_in_chunk` does."""
+    """Compare as `less_in_chunk`, for 8 chains, each with its own code and its own place in `numbers`."""
     masks = ir.Constant(ir.VectorType(lane.type, LANES), ir.Undefined)
     numbers, codes = builder.gep(numbers, [row]), builder.gep(codes, [base])
     for i in range(LANES):

@@ -79,7 +79,7 @@ class ReferenceBM2(BM2Kernel):
         return reason
 
     def _stochastic_bits(self, bit: int, random: list[int]) -> set[int]:
-        """Return the set of values (0, 1) that the compared CDEs make for a bit of the move: one if they agree."""
+        """Return the set of values (0, 1) that the compared CDEs draw for a bit; a single value if they agree."""
         concerned = self._concerned[bit]
         bits = {int(random[cde] < self._code(cde, bit)) for cde in concerned}
         if self._parameters.literal:

@@ -40,10 +40,10 @@ KEPT_BYTES: Final = 64 * 2**20
 """Maximum size in bytes of the cache of a machine's words; the operating system allocates only the part in use."""
 
 KEPT_CYCLES: Final = 2**17
-"""Number of a frame's first cycles whose words may be cached."""
+"""Number of cycles from the start of a frame for which the cells' words may be cached."""
 
 PREPARED_CYCLES: Final = 2**14
-"""Number of a frame's first cycles whose words `prepare` computes."""
+"""Number of cycles from the start of a frame for which `prepare` computes the cells' words."""
 
 
 class FastBM1(BM1Kernel):

@@ -91,7 +91,7 @@ def _store(
     row_code: npt.NDArray[np.int64],
     slots: int,
 ) -> _Store:
-    """Allocate words in `slots` slots and a scratch slot."""
+    """Allocate the words of the given rows in `slots` slots, one per block of cycles, and in a scratch slot."""
     rows = len(row_code)
     return _Store(
         words=aligned((slots + 1, rows * BLOCK_WORDS), np.uint64),
@@ -289,7 +289,7 @@ def fill_blocks(
 
 @jit
 def _mask(first: int, end: int, mask: Words) -> None:
-    """Set the mask of a block to the cycles from `first` to `end` - 1."""
+    """Set a block's `mask`, one bit per cycle, to ones from cycle `first` to `end` - 1, and to zeros elsewhere."""
     for word in range(BLOCK_WORDS):
         start = word * WORD_BITS
         low = min(max(first - start, 0), WORD_BITS)

@@ -28,7 +28,7 @@ class BM1Kernel(ABC):
 
     @property
     def cycles(self) -> int:
-        """Cycles of this frame that the generators, and the longest-running replica, have run."""
+        """Cycles that the generators have run in this frame: as many as the longest-running replica."""
         return max(self._cycles)
 
     @property

@@ -227,7 +227,7 @@ class FrameCourse(ABC):
         """
 
     def conclude(self, results: Sequence[BoardResult]) -> Sequence[BoardResult]:
-        """Return the frame's results, with the data that this object stored during the slices in `BoardResult.kept`."""
+        """Return the frame's results; their `BoardResult.kept` is what this object stored during the slices."""
         return results
 
 

@@ -187,7 +187,7 @@ class BM1Parameters:
 
     @property
     def input_shape(self) -> tuple[int, ...]:
-        """Shape of a frame's inputs: [sensors], or with inputs per cell [sensors, lines]; replicas are a first axis."""
+        """Shape of a frame's inputs: [sensors], or [sensors, lines] with one per cell; replicas are a first axis."""
         shape = (self.sensors,) if self.sensor_mode is SensorMode.COLUMN else (self.sensors, self.lines)
         return shape if self.replicas == 1 else (self.replicas, *shape)
 

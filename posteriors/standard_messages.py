@@ -53,8 +53,9 @@ class Plane(NamedTuple):
 
     @classmethod
     def of(cls, dimensions: Sequence[Dimension], *, square: bool = False) -> Self:
-        """Return the plane of a result's dimensions, or raise a ValueError: it has none, or the cells are not `square`.
+        """Return the plane of a result's dimensions.
 
+        A ValueError if they span no plane, or if its cells must be `square` and are not.
         x and y are the variables of these names; with other names, the last one is x.
         """
         if len(dimensions) != 2 or dimensions[0].label == REPLICA:

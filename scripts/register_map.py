@@ -89,7 +89,7 @@ class Block:
 
     @property
     def reset(self) -> str:
-        """The value after a reset in VHDL."""
+        """The block's value after a reset, as a VHDL expression."""
         value = self.value(writable=True)
         return " & ".join([literal(value)] * self.words) if value else "(others => '0')"
 

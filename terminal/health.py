@@ -151,7 +151,7 @@ async def serve_health(
     import asyncio
 
     class Answering(asyncio.Protocol):
-        """One connection. It does not use asyncio's streams, which would keep the error of a client that has gone."""
+        """A client's connection, without asyncio's streams, which would keep the error of a client that has gone."""
 
         def connection_made(self, transport: asyncio.BaseTransport) -> None:
             writing = cast("asyncio.Transport", transport)

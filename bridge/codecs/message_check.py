@@ -87,7 +87,10 @@ def bundled_definitions(type_name: str, ros_version: int) -> Definitions:
 
 
 def element_of(kind: Any, content: Any) -> tuple[str, int]:
-    """Return the type of a field's elements, from rosbags, and their number: `SCALAR`, 0 for any, or a fixed one."""
+    """Return a field's element type and length, from its description by rosbags.
+
+    The length is `SCALAR` for a field that is no array, and 0 for an array of any length.
+    """
     match kind.name:
         case "BASE":
             return str(content[0]), SCALAR

@@ -85,9 +85,9 @@ class OutgoingMessage:
     _parsed: dict[str, Any] | None
     """The parsed message, or None if it was not parsed yet."""
     _type: str
-    """Its type, or the empty string."""
+    """The message's type, or the empty string."""
     _time_ns: int
-    """The time of its receipt in nanoseconds since 1970, for cbor-raw."""
+    """The time of the message's receipt in nanoseconds since 1970, for cbor-raw."""
     _definitions: MessageDefinitions
     _max_size: int
     """Maximum number of bytes on the wire."""

@@ -131,7 +131,7 @@ def codes(
 
 
 def _numbers(random: np.random.Generator, parameters: BM1Parameters) -> NDArray[np.uint32] | None:
-    """Return a table of random numbers, seldom with a power of two as length; None if the machine uses none."""
+    """Return a table of random numbers, often of a length that is no power of two; None if the machine has no table."""
     if parameters.rng is not RngKind.TABLE:
         return None
     length = int(random.choice([1, 2, 17, 64, 199, 500]))

@@ -62,7 +62,7 @@ class Check:
 
 
 def sessions(count: int) -> list[Check]:
-    """Return the sessions on the first `count` random machines."""
+    """Return the checks that run a session of frames on each of the first `count` random machines."""
     return [Check("session", str(seed)) for seed in range(count)]
 
 

@@ -29,7 +29,7 @@ KEEPALIVE_S: Final = 5
 
 
 class Connection:
-    """A connection of a host or loader; the board's challenge or greeting is its first frame."""
+    """A connection of a host or loader to the board, which sends the first frame: a challenge or its greeting."""
 
     def __init__(
         self, connection: socket.socket, key: bytes, greeting: bytes, link: LinkModel | None = None

@@ -170,7 +170,7 @@ class RtlBoard:
             self._refuse(refused, is_first=refused == address)
 
     def _check_extent(self, address: int, count: int) -> None:
-        """Refuse an access outside the map, which the hardware's address cannot express."""
+        """Refuse an access outside the map, because the hardware's address is too narrow for one."""
         if not count or address >= rm.BAR_SIZE:
             raise RefusedError(ErrorCode.OUTSIDE, f"nothing is at {address:#06x}")
         if address + 4 * count > rm.BAR_SIZE:

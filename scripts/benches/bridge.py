@@ -49,7 +49,7 @@ QUANTITIES = ("published/s", "CPU us each", "received/s", "CPU us each ", "round
 Figures = defaultdict[tuple[int, str], defaultdict[str, list[float]]]
 """Measurements: first by the number of values and the measured quantity, then by client."""
 Drops = defaultdict[tuple[str, int], int]
-"""Number of messages that the hub dropped because the socket that counts them was slow, by client and array length."""
+"""Number of messages that the hub dropped because the receiving socket was slow, by client and array length."""
 
 
 async def server_rate(uri: str, number: int) -> float:

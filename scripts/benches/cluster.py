@@ -192,7 +192,7 @@ def _address_in(file: Path) -> str:
 
 
 def seconds_of(work: Designs | Recording, run: Run) -> float:
-    """Return the time of some work that writes a new file; on ext4, replacing a large file takes 0.2 s longer."""
+    """Return the time of some work, after removing its output: ext4 takes 0.2 s longer to replace a large file."""
     work.output.unlink(missing_ok=True)
     begun = time.perf_counter()
     work(run)

@@ -34,11 +34,11 @@ from toolchain.models.distribution import Distribution
 from toolchain.networks import read_network
 
 SINGLE_AIMS: Final = {"sprinkler": 6e7, "alarm": 2e7}
-"""Cycles a second of one chain."""
+"""Minimum number of cycles per second of one chain, by network."""
 RATIO_AIMS: Final = {"sprinkler": 10, "alarm": 2}
 """Minimum ratio of the cycles per second of many chains to those of one chain."""
 MANY: Final = {"sprinkler": 512, "alarm": 32}
-"""Number of chains in a run of many."""
+"""Number of chains of a network that run at once, for comparison with one chain."""
 TURNS: Final = 3
 """Times that each alternative is measured; the fastest counts, because other processes only slow it down."""
 BURN_IN: Final = 100

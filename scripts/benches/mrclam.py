@@ -33,7 +33,7 @@ MAX_CYCLES = 2**22
 """Limit of cycles, above 2^17, because in frames with three outliers the best line counts once in 4e5 cycles."""
 
 Figures = dict[str, Any]
-"""One robot's run with one model, by column: distances in metres; those named `exact` are by float64 inference."""
+"""Figures of one robot's run with one model, by column; distances are in metres, `exact` ones by float64 inference."""
 
 
 LandmarkReading = tuple[float | None, float | None]

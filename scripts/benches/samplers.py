@@ -40,7 +40,7 @@ class Sampled:
 def pyagrum_gibbs(
     pyagrum: Any, network: Any, names: Sequence[str], known: Known, *, sweeps: int, burn_in: int, limit: float
 ) -> Sampled:
-    """Run pyAgrum's Gibbs sampler over its variables in turn, until `sweeps` or the limit in seconds."""
+    """Run pyAgrum's Gibbs sampler, variable after variable, for `sweeps` sweeps or at most `limit` seconds."""
     gibbs = pyagrum.GibbsSampling(network)
     gibbs.setEvidence({names[variable]: value for variable, value in known.items()})
     gibbs.setDrawnAtRandom(False)

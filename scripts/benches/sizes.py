@@ -45,7 +45,7 @@ PARTS = {
 
 
 class Point(NamedTuple):
-    """One problem: the medians and the 10th percentiles of the times of its frames."""
+    """Measurements of one problem: medians over its frames, but for times the 10th percentiles."""
 
     lines: int
     sensors: int

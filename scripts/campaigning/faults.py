@@ -88,7 +88,7 @@ _REASONS = {
 
 
 def ended_roles(fault: Fault) -> tuple[str, ...]:
-    """Return the roles for which a fault counts as an end (see `ENDS`); a failed frame counts as an end of its board."""
+    """Return the roles that a fault ends, once per end (see `ENDS`); a board also ends when its frame fails."""
     if fault.what == "misbehave":
         return ("boards", "boards")  # it has been killed before
     if fault.target == BOARDS_PARENT and fault.what == "kill":
@@ -114,7 +114,7 @@ def _reasons(fault: Fault, topology: Topology) -> set[str]:
 
 
 def excuses_of(step: Step, topology: Topology, until: float = 0.0) -> Excuses:
-    """Return the losses that a step explains: those that the stack counts, and those of messages between processes."""
+    """Return the losses that a step explains: those that the stack counts, and readings and results in transit."""
     reasons: set[str] = set()
     readings = results = False
     for fault in step:

@@ -78,8 +78,8 @@ class Injector:
     async def _misbehave(self, fault: Fault) -> None:
         """Restart a board that misbehaves once after some frames, and wait until it has done so.
 
-        Each frame starts the board at least once. So it has misbehaved when another frame has failed; if the host
-        tolerates this misbehaviour, it has done so after enough frames.
+        The board has misbehaved as soon as another frame fails. If the host tolerates the misbehaviour, no frame fails;
+        then enough completed frames are the sign, because each frame starts the board at least once.
         """
         await self._stack.kill(fault.target)
         await self._stack.wait(fault.target)

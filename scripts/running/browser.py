@@ -90,7 +90,7 @@ class Visit:
         return int(await self.page.evaluate(NUMBER))
 
     async def frame_above(self, number: int) -> int:
-        """Wait until a later frame is shown, and return its number."""
+        """Wait until a frame after `number` is shown, and return its number."""
         return int(await self.until(f"number => {NUMBER} > number && {NUMBER}", number))
 
     async def pause(self, *, state: bool = True, key: str = "") -> None:

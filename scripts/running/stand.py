@@ -67,7 +67,10 @@ class Stand:
         return self.folder / f"{name}.log"
 
     async def start(self, name: str, ready: str, *command: str, limit: float = 2 * PATIENCE) -> str:
-        """Start a process, by default with the command of its last start; return the text that shows its readiness."""
+        """Start a process, by default with the command of its last start.
+
+        Return the text that matched the regular expression `ready` in its output.
+        """
         self._commands[name] = command or self._commands[name]
         self._processes[name] = process = Process(name, self.log(name))
         if name not in self.shown:

@@ -230,7 +230,7 @@ async def check_steps(scene: Scene) -> None:
 
 
 async def check_drag(scene: Scene) -> None:
-    """Check that the posterior follows the boat, which is picked up with the mouse and dropped elsewhere."""
+    """Drag the boat elsewhere with the mouse, and check that the posterior follows."""
     for goal in GOALS:
         await scene.dragged(scene.visit, goal)
 
@@ -360,7 +360,7 @@ async def verify(arguments: argparse.Namespace) -> int:
 
 
 async def run_check(tally: Tally, name: str, check: Callable[[Scene], Awaitable[None]], scene: Scene) -> None:
-    """Run one check and report it; it also fails if a page has complaints."""
+    """Run one check and report it; a check also fails if the browser complains about a page."""
     started, why = time.monotonic(), None
     try:
         await check(scene)

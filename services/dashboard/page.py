@@ -1,7 +1,7 @@
 """The page, its socket and its files, as a web application.
 
 /          the page: layout, buttons and choices
-/live      WebSocket: messages of `View` to the browser, poses and switches from it
+/live      WebSocket: messages of `View` to the browser; new poses and switch settings from the browser
 /frames.*  the kept frames as files
 """
 

@@ -163,7 +163,10 @@ class PcieApp(RunService):
         self._searching = asyncio.ensure_future(search())
 
     def _answer(self, master: int, record: Record) -> None:
-        """Send the result of a frame, unless its master is gone: the next master numbers its frames from 1 too."""
+        """Send the result of a frame, unless its master is gone.
+
+        The next master also counts its frames from 1, and would take the result for one of its own.
+        """
         if master == self._link.masters:
             self._link.send(record)
 

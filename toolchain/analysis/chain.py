@@ -143,7 +143,7 @@ class ExactChain:
         return searched_values(self._parameters, words)
 
     def posterior(self, law: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the posterior from samples with this law: float64[values of the searched variables together]."""
+        """Return the posterior over the searched variables' joint values, float64[values], for a law of states."""
         p, used = self._parameters, self._searched >= 0
         size = int(np.prod([p.cardinalities[variable] for variable in p.searched]))
         found = np.bincount(self._searched[used], law[used], size)

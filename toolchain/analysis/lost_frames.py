@@ -25,8 +25,9 @@ from toolchain.errors import BuildError
 TOLERATED: Final = 0.01
 """Share of lost frames above which a build and a check warn."""
 _WORK: Final = 2**26
-"""Maximum number of comparisons of points with codes, which take less than a second; `_LEAST_FRAMES` of a very
-large model take more.
+"""Maximum number of comparisons of points with codes, for less than a second of computing.
+
+A very large model exceeds it, because at least `_LEAST_FRAMES` frames are computed.
 """
 _MOST_FRAMES: Final = 1000
 _LEAST_FRAMES: Final = 10

@@ -60,7 +60,8 @@ def _missing(variable: Variable, what: str) -> int | None:
 def _unserved(variable: Variable, value: float, beyond_top: bool | None) -> int | None:
     """Return the address that `on_range` gives a value out of range, None for missing, or raise an error.
 
-    `beyond_top` is True for a value beyond the last one, False for one before the first; None if neither is nearer.
+    `beyond_top` is True if the value lies beyond the variable's last value, False if before its first; None if the
+    variable is periodic, so that neither end is nearer.
     """
     if variable.on_range == "missing":
         return _missing(variable, f"is {_shown(value)}, out of range")

@@ -41,7 +41,7 @@ class FittedRecording(Section):
 
 
 class FittedVariable(Section):
-    """`[[variable]]` of a fit file; with the method `counts` only name and rows: the table is a separate array."""
+    """`[[variable]]` of a fit file; with the method `counts` it has only name and rows, and its table is elsewhere."""
 
     name: str
     rows: int = Field(ge=0)

@@ -95,7 +95,7 @@ def eliminate(terms: Iterable[Term], names: Iterable[str], sizes: Mapping[str, i
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """An order of elimination, complete unless `largest`, the size of its largest table, exceeds the limit."""
+    """An order of elimination; it is incomplete if its largest table, with `largest` entries, exceeds the limit."""
 
     order: tuple[str, ...]
     entries: int
@@ -275,7 +275,7 @@ class Links:
 
 
 def relevant(factors: Iterable[Factor], asked: set[str]) -> list[Factor]:
-    """Remove factors that sum to 1: distributions of symbols not in `asked`, on which no other symbol depends."""
+    """Remove factors that sum to 1: distributions of symbols that are neither in `asked` nor parents of others."""
     kept = list(factors)
     uses: dict[str, int] = {}
     own: dict[str, int] = {}

@@ -78,7 +78,7 @@ def memories(deployment: Deployment, images: Sequence[Image]) -> tuple[Memory, .
 
 
 def column_name(board: int, column: int, sensors: int) -> str:
-    """Return the file name of a board's column, counted from 1; names with the same `sensors` have the same length."""
+    """Return the file name of a board's column, counted from 1, with as many digits as the number `sensors` has."""
     return f"board{board}_column{column:0{len(str(sensors))}d}.mif"
 
 

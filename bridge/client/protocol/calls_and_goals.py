@@ -252,7 +252,7 @@ class ServedServices(_Served):
 
 
 class ServedActions(_Served):
-    """The actions, and the goals that are being executed, by their ids on the wire."""
+    """The actions that this client offers, and their goals in execution, by the goals' ids on the wire."""
 
     kind = "action"
 

@@ -72,7 +72,7 @@ class Scene(NamedTuple):
 
 
 async def grid_and_pose(stand: Stand) -> dict[str, tuple[str, bytes, dict[str, Any]]]:
-    """Return type, bytes and content of the grid and the pose of one frame, after putting the boat in its place."""
+    """Put the boat at `PLACE`, and return type, bytes and content of the grid and the pose of one frame there."""
     types = {"/bm/posterior": "nav_msgs/OccupancyGrid", "/bm/pose": "geometry_msgs/PoseWithCovarianceStamped"}
     store = get_typestore(Stores.ROS1_NOETIC)
     async with asyncio.timeout(2 * PATIENCE), connect(stand.uri, check_types=False) as ros:
