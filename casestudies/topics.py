@@ -1,4 +1,4 @@
-"""Topics of case studies: publications that may drop messages, readiness, and frames with their true positions."""
+"""Shared code of case studies: lossy publications, readiness, and frames with the robot's true positions."""
 
 import asyncio
 import contextlib

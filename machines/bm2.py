@@ -419,7 +419,7 @@ def pack(parameters: BM2Parameters, values: Sequence[int]) -> int:
 
 
 def unpack(parameters: BM2Parameters, state: int) -> tuple[int, ...]:
-    """Return the code of every variable in a packed state; an unused code is not a value of its variable."""
+    """Return the code of every variable in a packed state, even if a code is not below the variable's cardinality."""
     return tuple(
         state >> offset & (1 << bits) - 1
         for offset, bits in zip(parameters.offsets, parameters.bits, strict=True)

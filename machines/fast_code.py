@@ -190,7 +190,7 @@ def _select(
     new_rows: bool,
     rows: int,
 ) -> int:
-    """Find a replica's lines that can count, and for each the rows to AND; clear their counters.
+    """Find a replica's lines that can count, and for each the rows of bits to AND; clear the lines' counters.
 
     With `new_rows`, each code without a row is assigned the next free row, from `rows` on. Returns the number of
     assigned rows.

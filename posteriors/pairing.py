@@ -23,7 +23,8 @@ class Pairing:
     Servers preserve the order within a topic, but not always between topics. So the next posterior belongs to
     the next report of a published frame, unless their times of arrival (`heard_ns`) show a loss. If the report arrived
     more than `disorder_ns` after the posterior, the posterior's own report was lost. If it arrived more than
-    `disorder_ns` before, and the next report is not too late for the posterior, the first report's posterior was lost.
+    `disorder_ns` before, and the report after it is not too late for the posterior, then this earlier report's
+    posterior was lost.
 
     Attributes:
         announced_only: Number of reports whose posterior never arrived.

@@ -115,8 +115,8 @@ def grid_message(
 ) -> dict[str, Any]:
     """Return a posterior as a nav_msgs/OccupancyGrid, whose cells must be square.
 
-    The value of a cell is `round(98 p / p_max)`, at `y * width + x`; x and y increase, whatever the sign of
-    their steps.
+    The value of a cell is `round(98 p / p_max)`, at index `y * width + x`. Cells are in the order of increasing
+    x and y, even if an axis has a negative step.
     """
     cells = plane.cells(posterior)[:: -1 if plane.y.step < 0 else 1, :: -1 if plane.x.step < 0 else 1]
     data = np.rint(cells * (MOST_OCCUPIED / posterior.max())).astype(np.int8)

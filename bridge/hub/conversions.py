@@ -172,7 +172,7 @@ def cbor_encoder(
 ) -> Encode | None:
     """Return the function that encodes a message with typed arrays; None if no field has an array of numbers.
 
-    `defaults` returns a type's defaults, and `known` stores the functions of the types that occur inside this one.
+    `defaults` returns a type's defaults, and `known` stores the functions of nested message types.
     """
     encoders: dict[str, Encode] = {}
 

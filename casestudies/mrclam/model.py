@@ -70,8 +70,8 @@ def model(
         landmarks: A CSV file with the columns landmark, x_m, y_m; the data set's README says where to get it.
         width: Cells along x in [-2, 7] m.
         height: Cells along y in [-7, 7] m.
-        floor: Likelihood of an outlier everywhere, relative to the peak of the bins' likelihood. Codes of 8
-            bits round 1e-3 to 0, and then a single outlier makes every line impossible.
+        floor: Likelihood of an outlier at every reading, relative to that of the most likely reading. Codes of
+            8 bits round 1e-3 to 0, and then a single outlier makes every line impossible.
         range_step: Metres between distinguishable ranges, from 0; longer ranges are clamped.
         range_values: The number of distinguishable ranges.
         bearing_values: The number of distinguishable bearings in a turn; readings are radians, plus any number of

@@ -103,7 +103,7 @@ class PlayedFrame:
     outcome: str
 
     def estimate(self) -> tuple[float, float] | None:
-        """Return the posterior's mean (x, y) in metres, or raise a BadResultError if it is not over the area."""
+        """Return the posterior's mean (x, y) in metres, or raise a BadResultError if its axes are not y and x."""
         if self.posterior is None:
             return None
         if len(self.posterior.sizes) != 2:

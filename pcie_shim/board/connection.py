@@ -132,7 +132,7 @@ class Connection:
         self.send(reply + self._greeting)
 
     def send(self, data: bytes) -> None:
-        """Send bytes, those of one `answer` together; close the connection if the peer accepts nothing for SEND_S."""
+        """Send bytes, all those of an `answer` at once; close the connection if the peer accepts nothing for SEND_S."""
         self._unsent += data
         if not self._answering or len(self._unsent) >= _TOGETHER:
             self._flush()

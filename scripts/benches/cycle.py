@@ -126,8 +126,8 @@ class Measured:
         """Measure the stages of some frames.
 
         The stages on the wire are measured with this client's clock, which the host shares: from the reading's stamp to
-        its receipt by the subscriber, and from the start of the publication to the result's arrival here. The
-        timed turns do not measure stages, because a subscription to /bm/frame costs the hub and the client time.
+        its receipt by the subscriber, and from the start of the publication to the result's arrival here. Stages
+        are measured apart from cycle times, because a subscription to /bm/frame costs the hub and the client time.
         """
         frames = ros.subscribe("/bm/frame", "diagnostic_msgs/DiagnosticArray")
         await ros.call("/rosapi/get_time")  # so that the hub knows the subscription

@@ -1,10 +1,10 @@
-"""The link to the boards by size of a transfer, boards and partitions, for each --link-rate (thesis 2.3, 4.3).
+"""The time of transfers over the link by their size and the number of boards, for each --link-rate (thesis 2.3, 4.3).
 
 bench ── blocks of 1 to 8,192 words ──▶ INPUTS of 1, 2 or 4 boards, and back
-bench ── frames of 4,096 results on 1, 2 or 4 boards, sent with the done message or read ──▶ the time besides computing
+bench ── frames of 4,096 results on 1, 2 or 4 boards, sent with the done message or read ──▶ time without computing
 
-The time of the socket alone (`none`) is part of every measurement. The rate and the latency of a modelled link are
-fitted to the difference from it, so that they come from the clock of the host and not from the model.
+The time of the socket alone (--link-rate none) is part of every measurement. It is subtracted before the rate and the
+latency of a modelled link are fitted, which thus come from the clock of the host and not from the model.
 """
 
 import argparse
@@ -96,7 +96,7 @@ def write(links: Sequence[SocketLink], words: int) -> None:
 
 
 def post(links: Sequence[SocketLink], words: int) -> None:
-    """Post a block to every board, and then ask each for a word, which it answers when the block has arrived."""
+    """Post a block to every board, and then read a word of each; a board answers when the block has arrived."""
     block = bytes(4 * words)
     for link in links:
         link.post([(rm.INPUTS, block)])

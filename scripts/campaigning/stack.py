@@ -29,7 +29,7 @@ BOARD_TIMEOUT = 2.0 * FACTOR
 
 
 class Topology(StrEnum):
-    """The share of the processes that the campaign starts instead of the master, and the places of its proxies."""
+    """The processes that the campaign starts instead of the master, and the parts between which its proxies stand."""
 
     OWN = "processes"
     """The master starts services and boards; a proxy stands between them and rosbridge."""

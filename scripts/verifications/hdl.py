@@ -33,7 +33,7 @@ from toolchain.hardware import Simulator
 SESSIONS: Final = 60
 """Number of random machines in the matrix."""
 BOARD: Final = 1
-"""The board of the boat that is simulated: 256 lines in the middle of the map."""
+"""Index of the board that is simulated, among those of the boat: it has 256 lines in the middle of the map."""
 _COMPILING_S: Final = 1200.0
 _ANSWER_S: Final = 120.0
 

@@ -198,7 +198,7 @@ def failing(error: type[Exception], otherwise: str, naming: str = "") -> Iterato
 
 
 async def check_json(stand: Server) -> None:
-    """Check JSON with both forms of type names, lists and arrays."""
+    """Check messages in JSON: type names in both forms, and values in lists and in NumPy arrays."""
     for type_name in ARRAY_TYPES.values():
         await check_passes(stand, [1, 2.5], type_name)
     values = np.random.default_rng(1).normal(size=1024)
@@ -350,7 +350,7 @@ async def check_goal(stand: Server) -> None:
 
 
 async def check_wrong_type(stand: Server) -> None:
-    """Check that the error of a subscriber that gets no message contains the server's message about a wrong type."""
+    """Check that a subscriber with a wrong type, which gets no message, has an error with the server's reason."""
     topic = stand.topic()
     async with stand.clients() as (subscriber, publisher):
         await publisher.advertise(topic, ARRAY)

@@ -106,7 +106,7 @@ def packed(head: dict[str, Any], picture: bytes = b"") -> bytes:
 
 
 def default_labels(frame: KeptFrame) -> tuple[str, ...]:
-    """Return the first two searched variables, or the only one; `x` comes second, because the second is horizontal."""
+    """Return the first two searched variables, or the only one; `x` is the second, which is drawn horizontally."""
     first = frame.searched[:2]
     return first[::-1] if first[:1] == (_ACROSS,) and len(first) == 2 else first
 

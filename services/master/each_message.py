@@ -38,7 +38,7 @@ class EachMessagePeers(Peers):
 
     @property
     def not_ready(self) -> list[str]:
-        """The roles of peers that are not ready; during the run only pcie-app counts, as the others come and go."""
+        """The roles of peers that are not ready; during the run only pcie-app counts, because it alone stays."""
         return [role for role in super().not_ready if role == self.app.role or not self.begun.is_set()]
 
     @property

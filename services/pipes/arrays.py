@@ -50,7 +50,7 @@ _RANGES: Final[dict[str, tuple[float, float]]] = {
     **dict.fromkeys(("float32", "float"), (-_FLOAT32_MAX, _FLOAT32_MAX)),
     **dict.fromkeys(("float64", "double"), (-sys.float_info.max, sys.float_info.max)),
 }
-"""Lowest and highest number of each numeric type; rosapi of ROS 2 writes `float` and `double`."""
+"""Lowest and highest number of each numeric type; `float` and `double` are the names in rosapi of ROS 2."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,1 +1,1 @@
-"""Local sockets of the processes, and the records on them."""
+"""Local sockets between the master and its services, and the records that these exchange."""

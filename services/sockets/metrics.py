@@ -25,7 +25,7 @@ _ANSWER_TIME: Final = 2.0
 """Seconds in which the event loop must return the status."""
 
 _Family = tuple[type[CounterMetricFamily | GaugeMetricFamily], str, str, str, Mapping[str, float]]
-"""Kind, name, help, the label after `process` (empty if there is none), and the values by the value of that label."""
+"""Kind, name, help, second label after `process` (or empty), and the numbers, one for each value of that label."""
 
 
 @contextlib.asynccontextmanager

@@ -99,7 +99,7 @@ class ExactChain:
 
     @cached_property
     def sweep(self) -> NDArray[np.float64]:
-        """float64[states, states]: the chance of each next state after a sweep."""
+        """float64[states, states]: the probability that a sweep leads from one state (row) to another (column)."""
         after = np.eye(self._one.shape[1])
         if self._parameters.sequencer is Sequencer.RANDOM:
             mean = np.mean([self._moved(after, move) for move in self._moves], axis=0)

@@ -267,7 +267,7 @@ class EqualMemories:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Memories:
-    """The memories of a machine; `logic_tables` of them are in memory LABs, because no block was left for them."""
+    """The memories of a machine; `logic_tables` is the number of tables in memory LABs, for which no block was left."""
 
     table_bits: int
     blocks: int

@@ -200,8 +200,8 @@ def recorded_readings(
 
     With `in_sequence`, these are the first rows, and one that does not fit is kept with all its readings missing.
 
-    `given` has NAME=COLUMN for each variable whose column has another name, with `*` for the same text in both;
-    in a bag with several topics, the messages of one row may be up to `tolerance_s` apart.
+    `given` has NAME=COLUMN for each variable whose column has another name; a `*` in both stands for the same text.
+    In a bag with several topics, the messages of one row may be up to `tolerance_s` apart.
 
     Raises:
         ModelError: The recording or a column does not exist, or no row fits the machine.

@@ -69,7 +69,7 @@ def _run_on(deployment: Deployment, machines: Sequence[Any], readings: Readings)
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """The job of a recording's frames: piece n is row n, which is frame n + 1 of a master."""
+    """The `toolchain.cluster.Job` that computes a recording's frames: piece n is row n, a master's frame n + 1."""
 
     deployment: Deployment
     machines: Sequence[Any]

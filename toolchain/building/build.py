@@ -257,9 +257,8 @@ def describe(plan: MachinePlan | BM2Plan, layout: BoardLayout, images: Sequence[
 def known_variables(plan: MachinePlan | BM2Plan) -> tuple[Variable, ...]:
     """Return the known variables as a deployment has them, with their sources and paths in messages.
 
-    With `--sensor-mode threshold`, the values of a sensor are codes.
-
-    A BuildError if `--order`, `--path` or a sources file names what the model does not have.
+    With `--sensor-mode threshold`, the values of a sensor are codes. A BuildError is raised if `--order`, `--path` or
+    a sources file names a variable that the model does not have.
     """
     options, variables = plan.options, plan.model.variables
     variables = variables if options.sources is None else options.sources.place(variables)

@@ -159,7 +159,7 @@ def edited_sentence(deployment: Deployment) -> str:
 
 
 def _topics_sentence(deployment: Deployment) -> str:
-    """Name the sources of readings (with their variables, if there are several) and the topic of the posteriors."""
+    """Name the topic of the posteriors and the sources of readings; several sources are listed with their variables."""
     output = deployment.outputs[0]
     places = [f"{source.uri}, topic {source.topic} ({source.type})" for source in deployment.sources]
     if len(places) == 1:

@@ -164,7 +164,8 @@ def _opposite_clips(chain: CheckedChain) -> Iterator[Finding]:
 def _slowest(machine: BM2Machine, bit: int, blanket: Sequence[int]) -> tuple[float, int, int]:
     """Return the largest mean cycles of a move at a bit that two CDEs clip in opposite directions, and these CDEs.
 
-    All used values of `blanket`, the bits that share a factor with it, are tried; the cycles are 0 without such clips.
+    `blanket` contains the bits that share a factor with this bit; all their values that occur are tried. If no two
+    CDEs clip in opposite directions, the cycles are 0.
     """
     p, index = machine.parameters, np.arange(1 << len(blanket))
     values = {other: index >> at & 1 for at, other in enumerate(blanket)}
@@ -186,7 +187,7 @@ def _slowest(machine: BM2Machine, bit: int, blanket: Sequence[int]) -> tuple[flo
 
 
 def _connections(chain: CheckedChain) -> Iterator[Finding]:
-    """Find two possible states that moves of single bits do not connect; every set of missing readings is tried."""
+    """Find two possible states between which no single-bit moves lead; every set of missing readings is tried."""
     p = chain.machine.parameters
     optional = [at for at in p.known if at not in chain.always_known]
     if p.state_bits > _STATE_BITS or p.state_bits + len(optional) > _PATTERN_BITS:

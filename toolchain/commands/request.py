@@ -1,4 +1,4 @@
-"""The model and the build options that a command line asks for: their flags, and how these are read."""
+"""The flags for a model and its build options, and the functions that read both from a command line."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, fields, replace

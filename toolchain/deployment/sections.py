@@ -174,7 +174,7 @@ class Scale(StrEnum):
     """The parts of a table that are each divided by their maximum before quantising."""
 
     ADDRESS = "address"
-    """The row of each address; with this choice, the machine needs the fewest cycles."""
+    """Each row, the part of the table for one address; with this choice, the machine needs the fewest cycles."""
     COLUMN = "column"
     """The whole table of a column."""
     NONE = "none"

@@ -13,7 +13,7 @@ class FitMethod(StrEnum):
     """A method of learning."""
 
     NORMALS = "normals"
-    """Bias, standard deviation and share of outliers of known variables that are normal around a known mean."""
+    """Bias, standard deviation and share of outliers, for variables that are normal around the model's mean."""
     COUNTS = "counts"
     """Whole tables, by counting how often each value was read at each true position."""
 

@@ -23,7 +23,7 @@ from toolchain.models.model import MAX_ENTRIES
 
 _NAMED: Final = 6
 _CHEAP: Final = 2**16
-"""If the tables of the first order of elimination have fewer entries than this, the second is not planned."""
+"""If the tables of the min-weight order have at most this many entries in all, the min-fill order is not planned."""
 _MOST_COUNTED: Final = 64
 """Maximum number of neighbours of a symbol among which `_fill` counts the pairs."""
 

@@ -209,7 +209,7 @@ def present(directory: Path, files: OutputFiles) -> list[str]:
 
 
 def _stale(directory: Path, files: OutputFiles) -> list[str]:
-    """Return the paths that an earlier build wrote for this part, and that the part no longer has."""
+    """Return the paths of files of this kind that an earlier build wrote, and that `files` no longer contains."""
     return [name for name in present(directory, files) if name not in files.contents]
 
 

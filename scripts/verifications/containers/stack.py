@@ -53,7 +53,7 @@ class Stack:
 
     @property
     def environment(self) -> dict[str, str]:
-        """The environment of docker commands: the compose file gets its variables only from the check."""
+        """The environment of docker commands, without the user's other variables, which the compose file would read."""
         names = ("HOME", "LANG", "TMPDIR", "PATH", "DOCKER_HOST", "DOCKER_CONFIG")
         kept = {name: os.environ[name] for name in names if name in os.environ}
         extra = {"COMPOSE_ANSI": "never", "COMPOSE_PROGRESS": "plain", "BUILDKIT_PROGRESS": "plain"}
