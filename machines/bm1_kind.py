@@ -261,7 +261,7 @@ class _OnBoard(BoardMachine):
 
 
 class _Course(FrameCourse):
-    """A frame on boards that share the lines of one model, or of its replicas."""
+    """The course of a frame on boards which together hold the lines of one model, or of all its replicas."""
 
     def __init__(
         self, starts: Sequence[Blocks], settings: FrameSettings, frame: FrameInput, replicas: int

@@ -107,7 +107,7 @@ class Chains:
         return tuple(results)
 
     def _run_together(self, starts: Sequence[BM2Start]) -> list[ChainResult] | None:
-        """Run the chains sliced or in step; None if neither can run them, or if a chain may not draw all samples."""
+        """Run the chains sliced or in step; return None if they allow neither, or if one may not draw all samples."""
         parameters, first, count = self._parameters, starts[0], len(starts)
         if (
             count < IN_STEP
@@ -291,9 +291,9 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
 ) -> bool:
     """Run sliced chains to their ends, and set `ends`; return False if a chain may reach a limit before its end.
 
-    Of the vectors, `counts` has a counter of sweeps, which overflows at the end of the burn-in and of the chain, and a
-    counter of samples for each state but 0. `room` is working space: for the contexts' bits or a sample's events, and
-    for carries.
+    Of the vectors, `counts` has a counter of samples for each state but 0, and a counter of sweeps, which overflows at
+    the end of the burn-in and at the end of the chain. `room` is working space for carries, and for either the
+    contexts' bits or a sample's events.
     """
     numbers, values, pointed, counts, room = vectors
     burn_in, samples, max_cycles, window, steps = limits

@@ -127,7 +127,7 @@ class BM2Kernel(ABC):
 
     @abstractmethod
     def _load(self, start: BM2Start) -> None:
-        """Prepare the frame: set state, results, the stream's buffer and the generators as at its start."""
+        """Set the state, the results, the stream's buffer and the generators to their values at the frame's start."""
 
     @abstractmethod
     def _empty_stream(self) -> None:

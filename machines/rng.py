@@ -1,9 +1,9 @@
 """The random number generators of a machine: seeds, steps and outputs.
 
 BM1 has one generator for each column, or for each cell if they are not shared; BM2 has one for each CDE. Each
-generator has a serial number: its column or CDE, or line * columns + column for a cell. In seed set s, s times the
-count of generators is added to it. The state of a generator is one uint64, and a cell or CDE compares its code with
-the low `prob_bits` bits of the output.
+generator has a serial number, from which its seed follows: its column or CDE, or line * columns + column for a cell,
+plus s times the count of generators for seed set s. The state of a generator is one uint64, and a cell or CDE compares
+its code with the low `prob_bits` bits of the output.
 """
 
 import math

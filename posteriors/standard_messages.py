@@ -27,7 +27,7 @@ MAP_FRAME: Final = "map"
 MOST_OCCUPIED: Final = 98
 """Value of the most probable cell in a grid message, because rviz paints 99 and 100 as obstacles."""
 _HEADING_VARIANCE: Final = math.pi**2 / 3
-"""Variance of an angle that is uniform over the circle: a grid has no heading."""
+"""Variance of an angle that is uniform over the circle, published because a grid says nothing about the heading."""
 _METRES: Final = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "km": 1000.0}
 
 RosVersion = Literal[1, 2]

@@ -34,7 +34,7 @@ GENERATED: Final = (
     *("pcie_shim/register_map.py", "docs/reference/registers.md"),
     *("hdl/bm_register_map.vhd", "hdl/bm_register_block.vhd"),
 )
-"""The files that have a template."""
+"""The files that are generated from templates."""
 HEADER: Final = "hdl/bm_registers.h"
 
 
@@ -110,7 +110,7 @@ class RegisterMap:
 
     @cached_property
     def encodings(self) -> dict[Any, str]:
-        """Every encoding of a field in the order of first use, and the name of its first field."""
+        """Every encoding in the order of first use, and the name of the first field that uses it."""
         found: dict[Any, str] = {}
         for block in self.blocks:
             for field in block.fields:

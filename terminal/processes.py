@@ -303,7 +303,7 @@ class Screen:
             self._print("\r\033[K" if sys.stdout.isatty() else "\n")
 
     async def say_what_it_waits_for(self) -> None:
-        """Show the work after each `SILENCE` seconds without a line, until cancelled."""
+        """Show the name of the work in progress after each `SILENCE` seconds without a line, until cancelled."""
         try:
             while True:
                 await asyncio.sleep(max(self._newest + SILENCE - time.monotonic(), 0))

@@ -52,7 +52,7 @@ def _stop(number: int, _frame: object) -> None:
 
 
 def _report_dropped(dropped: sys.UnraisableHookArgs) -> None:
-    """Report an exception that Python drops, except for one of a signal, which `check_signals` raises again."""
+    """Report an exception that Python drops, but not a `StoppedError`, which `check_signals` raises again."""
     if not isinstance(dropped.exc_value, StoppedError):
         sys.__unraisablehook__(dropped)
 

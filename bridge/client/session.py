@@ -335,7 +335,7 @@ class Session:
         return f"; the largest so far was one of {largest}, with {size} bytes" if size else ""
 
     def why_left_out(self) -> str:
-        """Return the end of an error about a topic that is left out because a message exceeded `max_size`."""
+        """Return the last part of the error text for a topic that is left out after a message exceeded `max_size`."""
         return (
             f"is left out: a message of it has more than the {self.core.wire.max_size} bytes (max_size) that this "
             f"client of {self.uri} accepts"

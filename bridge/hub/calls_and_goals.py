@@ -158,7 +158,7 @@ class _Exchange:
             self._offers.pop(name, None)
 
     def ask(self, client: Client, operation: Operation, now: float) -> None:
-        """Perform `call_service` or `send_action_goal`: pass the request on to its server, or answer that it failed."""
+        """Pass a `call_service` or `send_action_goal` on to the client that offers it, or answer that it failed."""
         caller = Caller.of(client, operation, self.kind)
         try:
             self._start(caller, operation, now)

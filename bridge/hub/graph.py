@@ -53,7 +53,7 @@ class Client:
     wants_status: bool = False
     """True if the client requested status messages about refusals."""
     status_lane: Lane | None = None
-    """The queue of the status messages for the client, from the first one on."""
+    """The queue of the status messages for the client; created with the first message."""
     last_published: "Advertisement | None" = None
     """The advertisement that `envelopes` gave for the client's last message; tried first for the next message."""
     envelopes: dict[bytes, "Advertisement"] = field(default_factory=dict)

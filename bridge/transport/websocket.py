@@ -386,7 +386,7 @@ class WebSocketTransport(asyncio.Protocol):
             self.close_expected()
 
     def _assembled(self, frame: Frame) -> bytes | None:
-        """Return the whole message that `frame` completes, or None if more follow; the library limits its size."""
+        """Return the message that `frame` completes, or None if more frames follow; the library limits its size."""
         data = bytes(frame.data)
         if self._fragments is None:
             if frame.fin:

@@ -202,7 +202,8 @@ def draw_shares(
 ) -> None:
     """Draw figure 4.5, the mean time of each stage and its share of a frame's time, or raise an OutputError.
 
-    `note` is below the axis. The legend has the share of each part, and next to it the thesis's, if it is in `beside`.
+    `note` is below the axis. The legend has the share of each kind of stage, and next to it the thesis's share from
+    `beside`, if any.
     """
     figure = new_figure(8.4, 1.5 + 0.42 * max(len(shares), 1))
     axes = figure.subplots()

@@ -20,7 +20,7 @@ MAP_LOW: Final = -50.0
 """Lowest coordinate of the map, the square [MAP_LOW, MAP_HIGH]^2."""
 MAP_HIGH: Final = 50.0
 BEACONS: Final = ((-50.0, -50.0), (-50.0, 0.0), (0.0, -50.0))
-"""Positions of the beacons: lower left corner, middle of the left side, middle of the lower side (4.1)."""
+"""Positions of the beacons: lower left corner, middle of the left side, middle of the lower side (thesis 4.1)."""
 BEACON_NAMES: Final = ("beacon1", "beacon2", "beacon3")
 DISTANCE_NAMES: Final = ("D1", "D2", "D3")
 BEARING_NAMES: Final = ("B1", "B2", "B3")

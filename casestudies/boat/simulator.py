@@ -179,9 +179,9 @@ async def simulate(
 ) -> None:
     """Sail and publish `count` readings, or until cancelled; raise a BridgeError if no server answers at the URI.
 
-    Each step publishes true pose, compass and then the readings, with the same stamp. The readings on `topic` are a
-    `boat_msgs/Raw`, or with `array` a std_msgs/Float64MultiArray. If somebody else moves the boat or sets a switch,
-    readings are also published at once, between steps. While the server is away, the boat sails on.
+    Each step publishes first the true pose, then the compass, then the readings, all with the same stamp. The readings
+    on `topic` are a `boat_msgs/Raw`, or with `array` a std_msgs/Float64MultiArray. If somebody moves the boat or sets a
+    switch, readings are also published at once, between steps. While the server is away, the boat sails on.
     """
     from bridge.stamps import header
     from casestudies.topics import LossyPublication, connected, report_refused

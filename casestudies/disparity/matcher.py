@@ -159,7 +159,7 @@ class Matcher:
         self._warned: set[str] = set()
 
     def _warn_once(self, sentence: str, of: str = "") -> None:
-        """Warn, unless a warning about the topic `of`, or without a topic the same sentence, was printed before."""
+        """Warn once about the topic `of`; without a topic, print each sentence once."""
         if (key := of or sentence) not in self._warned:
             self._warned.add(key)
             warn(sentence)

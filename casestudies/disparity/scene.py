@@ -68,7 +68,7 @@ class _Box:
 
 
 class Scene:
-    """A wall, a floor, and things of random places and sizes in between, which sway from pair to pair."""
+    """A wall, a floor, and spheres and boxes of random places and sizes, which sway from pair to pair."""
 
     def __init__(self, seed: int) -> None:
         """Place everything; the same seed makes the same pairs."""

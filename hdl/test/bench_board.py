@@ -192,7 +192,7 @@ class Both:
         self.compare_states()
 
     async def compare_everything(self) -> None:
-        """Compare all implemented words, and the first unimplemented word after each block."""
+        """Compare both boards' implemented words, and the first unimplemented word after each block."""
         for block in rm.BLOCKS.values():
             for word in range(block.words):
                 if await self.read(block + 4 * word) is None and block not in _NOT_COMPARED:

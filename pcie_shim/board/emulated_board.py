@@ -132,7 +132,7 @@ class EmulatedBoard:
         resets it.
 
         Raises:
-            RefusedError: The machine is running, or the image is damaged or for another map.
+            RefusedError: The machine is running, or the image is damaged or for another register map.
         """
         if self.running:
             raise RefusedError(ErrorCode.BUSY, "the machine is running; reset it before programming")

@@ -136,7 +136,11 @@ class SocketLink:
             self._give_up(error)
 
     def _authenticate(self, frame: Frame, deadline: float, connect_timeout: float) -> Frame:
-        """Prove to have the key, check that the board has it, and return its greeting, or raise a KeyRefusedError."""
+        """Prove that this host has the key, check that the board has it, and return the board's greeting.
+
+        Raises:
+            KeyRefusedError: The keys differ.
+        """
         key = self.endpoint.key
         if frame.operation != framing.AUTHENTICATE:
             if key and frame.operation == framing.GREET:

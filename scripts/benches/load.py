@@ -175,7 +175,7 @@ async def probed(uri: str, row: Row) -> AsyncIterator[None]:
 
 
 async def attacked(uri: str, hub: int, name: str, seconds: float) -> Row:
-    """Measure two other clients, and the hub's maximum memory, during an attack."""
+    """Measure two well-behaved clients, and the hub's maximum memory, during a third client's attack."""
     row, attack = Row("under attack", name), ATTACKS[name]
     async with AsyncExitStack() as stack:
         for _ in range(20 if attack.readers else 0):

@@ -37,7 +37,7 @@ from toolchain.networks import read_network
 
 NETWORKS: Final = ("asia", "cancer", "earthquake", "survey", "sachs", "child", "alarm", "insurance")
 NO_ZEROS: Final = ("cancer", "earthquake", "survey", "sachs")
-"""Networks without a zero: any state leads to any other by changes of one variable."""
+"""Networks without zero probabilities: any state leads to any other by changes of one variable at a time."""
 AIM: Final = 0.01
 """Maximum total variation of a marginal on the networks `NO_ZEROS`, after a million sweeps."""
 COLUMNS: Final = (

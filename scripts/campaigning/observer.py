@@ -78,7 +78,7 @@ class Reading:
 
 @dataclass(frozen=True, slots=True)
 class _Announced:
-    """The contents of a report about the result that follows it."""
+    """The contents of a report on `/bm/frame`, until its result arrives on `/BMresults`."""
 
     number: int
     outcome: Outcome | None

@@ -1,4 +1,4 @@
-"""The runs of all tests, one kind after the other (see scripts/test)."""
+"""Runs of all tests, one kind of test after the other (see scripts/test)."""
 
 import json
 import subprocess

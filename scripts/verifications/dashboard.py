@@ -60,7 +60,7 @@ NAMELESS: Final = """() => [...document.querySelectorAll('button, a[href], input
     .filter(each => each.offsetParent && !(each.ariaLabel || each.innerText?.trim() || each.title
         || each.labels?.length || each.closest('[aria-label], [aria-hidden]')))
     .map(each => each.outerHTML.slice(0, 120))"""
-"""Finds visible controls and pictures without a name for screen readers."""
+"""Script that finds visible controls and pictures without a name for screen readers."""
 
 
 @dataclass
@@ -103,7 +103,7 @@ class Scene:
             await self.news.wait_for(condition)
 
     async def put(self, x: float, y: float) -> None:
-        """Put the boat somewhere, where it lies still, and wait until it is there."""
+        """Put the boat, which lies still, at (x, y), and wait until it is there."""
         place = await self.ros.advertise(SET_POSE_TOPIC, TRUE_POSE_TYPE)
         await place.publish(true_pose(x, y, header(time.time_ns(), "map")))
         await self.until(lambda: math.dist(self.boat, (x, y)) < 1, f"the boat is not at {x:g}, {y:g}")

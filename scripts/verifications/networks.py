@@ -224,7 +224,7 @@ def machine_difference(asked: Asked) -> float:
 
 
 def check(tally: Tally, pyagrum: Any, path: Path) -> None:
-    """Compare one network: the tables that our readers find in all formats, and its posteriors."""
+    """Compare with pyagrum one network's tables, read from a file of each format, and its posteriors."""
     began = time.monotonic()
     network = load(pyagrum, path)
     tables = tables_of(network)

@@ -232,7 +232,7 @@ def deserialised(raw: bytes, type_name: str) -> dict[str, Any]:
 
 
 async def check_raw(stand: Server) -> None:
-    """Check the serialised message with rosbags."""
+    """Check messages received with `compression="cbor-raw"`, which rosbags deserialises."""
     values = np.random.default_rng(3).normal(size=100)
     message = await stand.passed({"data": values}, compression="cbor-raw")
     same(deserialised(message.raw, ARRAY)["data"], values)

@@ -234,7 +234,7 @@ class WatchedRobot:
             await asyncio.sleep(_STATUS_EVERY)
 
     async def _learn_axes(self, folder: Path) -> None:
-        """Read the units from the deployment folder of this machine's master; without it, cells are only indices."""
+        """Read the units from the deployment folder of the master on this host; without it, cells are only indices."""
         try:
             deployment = await asyncio.to_thread(load_deployment, folder, images=False)
         except (ToolchainError, OSError) as error:

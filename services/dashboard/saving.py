@@ -12,7 +12,10 @@ from services.output.posterior_file import cell_names, write_archive
 
 
 def same_shape(frames: Sequence[KeptFrame], shown: KeptFrame | None) -> list[KeptFrame]:
-    """Return the frames whose posteriors have the variables of `shown`, or, if it has none, of the newest posterior."""
+    """Return the frames whose posteriors have the same variables as that of `shown`.
+
+    If `shown` has no posterior, the newest one decides.
+    """
     with_posterior = [each for each in frames if each.values is not None]
     if shown is None or shown.values is None:
         shown = with_posterior[-1] if with_posterior else None

@@ -35,7 +35,7 @@ _SENTENCES = 3
 
 
 def plain(text: str) -> str:
-    """Return a text without control characters, shortened to fit."""
+    """Return a text without control characters, shortened to `_SHOWN` characters."""
     kept = "".join(each if each.isprintable() else "?" for each in text[:_SHOWN])
     return kept if len(text) <= _SHOWN else f"{kept}..."
 

@@ -46,7 +46,7 @@ class ResultTopics:
     Attributes:
         rosbridges: The connections by URI.
         advertised: The output topics, once they are advertised; `reports` is the topic of the frame reports.
-        standard: The topics for robot tools, which follow a result.
+        standard: The topics for robot tools, which are published after results.
     """
 
     def __init__(self, settings: Settings, deployment: Deployment) -> None:

@@ -258,7 +258,7 @@ class _Echoes:
         return await self.at_most(most) if first or self._has_seen else not self._give_up(most)
 
     async def at_most(self, most: int) -> bool:
-        """Wait until at most `most` lines wait, and return True; at a timeout, count the older ones as lost (False)."""
+        """Return True once at most `most` lines are unseen; at a timeout, count the older ones as lost (False)."""
         while len(self._waiting) > most:
             self._seen.clear()
             try:

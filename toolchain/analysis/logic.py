@@ -80,7 +80,7 @@ class Of(StrEnum):
     """A bit of a counter, in bm1_counter, bm1_readout and bm1_matrix: its increment, its comparison with the target,
     and its selection for the host."""
     STATE_BIT = "state bit"
-    """A bit of the state of an LFSR (bm1_lfsr), which loads the seed or takes the steps of a cycle."""
+    """A bit of the state of an LFSR (bm1_lfsr): its logic loads the seed, or the state after a cycle's steps."""
     STEP = "step"
     """A step of an LFSR in a cycle (bm1_lfsr): the parity of the taps."""
     PLACE_BIT = "place bit"
@@ -167,7 +167,7 @@ def state_bits(p: BM1Parameters | BM2Parameters, table_length: int) -> int:
 
 
 def logic_of(parameters: BM1Parameters, *, table_length: int = LENGTH, inputs: int = 0) -> Logic:
-    """Return the logic of a machine on a board, without memories; a BuildError if its generators are only emulated.
+    """Return the logic of a machine on a board, without memories; raise a BuildError for ideal generators.
 
     `inputs` is the number of input words of the board's registers, if it is more than the machine needs.
     """

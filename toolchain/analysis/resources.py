@@ -35,7 +35,7 @@ class Estimate:
 
     @property
     def alms(self) -> float:
-        """All ALMs: those of the look-up tables, or of the registers if these need more, and those of memory LABs."""
+        """All ALMs: those of memory LABs, and the larger number of what look-up tables and registers need."""
         logic = max(self.logic.alms, self.logic.registers / self.device.registers_per_alm)
         return logic + self.memories.alms
 
@@ -128,7 +128,11 @@ def boards_needed(
     table_length: int = LENGTH,
     interface: tuple[int, int] | None = None,
 ) -> tuple[int, str]:
-    """Return the minimum number of boards for a machine, and why, as a sentence; a BuildError if none is enough."""
+    """Return the minimum number of boards for a machine, and a sentence that says why.
+
+    Raises:
+        BuildError: Not even one line fits a board.
+    """
 
     def why_not(lines: int) -> str:
         return _why_not(replace(parameters, lines=lines), device, table_length, interface)

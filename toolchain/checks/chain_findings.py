@@ -33,9 +33,9 @@ _STATE_BITS: Final = 20
 _PATTERN_BITS: Final = 24
 """Maximum number of state bits and optional known variables together, up to which connections of states are checked."""
 _BLANKET_BITS: Final = 16
-"""Maximum number of bits that share a factor with one bit; the search for opposite clips tries all their values."""
+"""Maximum number of bits that share a factor with one bit; all their values are tried in `Check.OPPOSITE_CLIPS`."""
 _RELATED_BITS: Final = 2048
-"""Maximum number of bits among which relations are searched, because all pairs are kept; a board may draw more."""
+"""Maximum number of random bits among which relations are searched, because all pairs of bits are kept."""
 _TIMEOUT_RISK: Final = 1e-6
 _MOVE_CYCLES: Final = 3.0
 

@@ -167,11 +167,11 @@ class Relation:
 
 
 def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> tuple[list[Relation], int]:
-    """Search for relations of 2, 3 or 4 bits between columns, in as many groups as a few seconds permit.
+    """Search groups of columns for relations of 2, 3 or 4 bits, as many groups as a few seconds permit.
 
-    Returns at most one relation of the fewest bits for each group, and the number of groups that were searched.
-    `seeds` are uint64[groups, columns]; the bits of a group's columns are ANDed. The low `prob_bits` bits of a
-    state are the random number that is compared with a code.
+    The bits of the columns of a group are ANDed by the machine. `seeds` are uint64[groups, columns]; the low
+    `prob_bits` bits of a state are the random number that is compared with a code. Returns at most one relation, of the
+    fewest bits, for each group, and the number of groups that were searched.
     """
     groups, columns = seeds.shape
     bits = columns * prob_bits

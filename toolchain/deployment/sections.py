@@ -162,7 +162,7 @@ class Stop(StrEnum):
 
 
 class Queue(StrEnum):
-    """The readings that wait if they arrive faster than frames are computed."""
+    """The choice of the readings that wait if readings arrive faster than frames are computed."""
 
     LATEST = "latest"
     """Only the newest reading waits; the readings that it replaces are counted."""

@@ -71,7 +71,7 @@ class Support:
     cells: int
     """Number of lines in which the variable was read at least once."""
     median: float
-    """The median number of such readings per line, over the lines that have any."""
+    """The median number of the variable's readings per line, over the lines that have any."""
     refused: int
     """Number of readings that are not values of the variable."""
 
@@ -174,10 +174,11 @@ def _normals(
 def mixture(
     residuals: Sequence[NDArray[np.float64]], widths: Sequence[float], *, bias: bool, least_sigma: float
 ) -> tuple[float, float, list[float]]:
-    """Fit one normal to all variables, and to each its share of outliers; return mean, standard deviation and shares.
+    """Fit one normal to all variables together, and a share of outliers to each variable.
 
-    `residuals` are the readings of each variable minus their means. Outliers of a variable are uniform over its
-    range, whose width is in `widths`. Without `bias`, the mean of the residuals is 0.
+    `residuals` are the readings of each variable minus the readings' means. Outliers of a variable are uniform over
+    its range, whose width is in `widths`. Without `bias`, the normal's mean is 0. Returns the normal's mean, its
+    standard deviation, and the shares.
     """
     everything = np.concatenate(residuals)
     mean = float(np.median(everything)) if bias else 0.0

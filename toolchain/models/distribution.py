@@ -1,4 +1,4 @@
-"""Symbols of a joint distribution, as in the library ProBT, and its factors: tables, normals, functions, potentials.
+"""Joint distributions as in the library ProBT: symbols, and factors (tables, normals, functions, potentials).
 
 Continuous distributions become tables: the integral of a normal over the interval of each value of its symbol, or the
 value of a function.

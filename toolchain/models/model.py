@@ -367,7 +367,7 @@ def exact_posterior(
 def fuse(prior: NDArray[np.float64], likelihoods: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:
     """Return the normalised product of a prior and likelihoods, float64[lines]; each may have any scale.
 
-    The product is a sum of logarithms, so that many small likelihoods don't underflow. If the product is 0 on every
+    The product is computed as a sum of logarithms, so that many small likelihoods don't underflow. If it is 0 on every
     line, a ModelError is raised.
     """
     with np.errstate(divide="ignore"):  # log 0 = -inf is an impossible line

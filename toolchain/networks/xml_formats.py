@@ -1,4 +1,4 @@
-"""Readers of network files in XML: GeNIe's XDSL and XMLBIF, without entities and of bounded depth."""
+"""Readers of network files in XML: GeNIe's XDSL, and XMLBIF. Entities and deep nesting are refused."""
 
 from __future__ import annotations
 

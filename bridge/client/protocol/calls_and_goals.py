@@ -43,7 +43,7 @@ MAX_SERVED_GOALS: Final = 64
 
 
 class _Pending:
-    """Pending calls or goals: names of their services or actions, by id on the wire."""
+    """The pending calls or goals: the name of the service or action of each, by the request's id."""
 
     def __init__(self, wire: Wire) -> None:
         self._wire = wire

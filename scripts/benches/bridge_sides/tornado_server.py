@@ -134,7 +134,7 @@ class Connection(tornado.websocket.WebSocketHandler):
         self.loop.add_callback(self.hand_out, json.dumps(operation))
 
     def hand_out(self, text: str) -> None:
-        """Send from the loop's thread."""
+        """Send an encoded operation to the client; called in the loop's thread."""
         if self.ws_connection is not None:
             self.write_message(text)
 

@@ -15,7 +15,7 @@ from scripts.verifications.checks import DownloadError
 
 FETCH_LIMIT: Final = 600.0 * FACTOR
 STOP_GRACE: Final = 60 * FACTOR
-"""Seconds that a service has to end after SIGTERM; then the engine kills it (exit code 137)."""
+"""Seconds after SIGTERM at which the engine kills a service that is still running (exit code 137)."""
 PROBED: Final = (
     *("master", "subscriber", "publisher", "pcie-app", "boards"),
     *("hub", "boat-simulator", "boat-normaliser", "boat-viewer", "dashboard"),
