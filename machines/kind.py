@@ -116,7 +116,7 @@ class Inference(NamedTuple):
 
     @property
     def best(self) -> int:
-        """The most probable line of the posterior; -1 without one."""
+        """The most probable line of the posterior; -1 without a posterior."""
         return -1 if self.posterior is None else int(self.posterior.argmax())
 
 

@@ -107,7 +107,7 @@ def _image(shades: NDArray[Any]) -> str:
 
 
 def draw(all_axes: Sequence[Axis], all_values: NDArray[np.float64], into: Any) -> Any:
-    """Draw bars or a map in matplotlib's Axes, by default those of a new figure, and return them."""
+    """Draw bars or a map in matplotlib's Axes, by default those of a new figure, and return the Axes."""
     if into is None:
         from matplotlib import pyplot as plt
 

@@ -140,11 +140,11 @@ class Offer:
     type: str
     client: Client
     fillers: Mapping[str, Filler]
-    """Fillers of the absent fields of its parts, by part, such as `Request`; empty if the type is unknown."""
+    """Fillers of absent fields, by part of the type, such as `Request`; empty if the type is unknown."""
 
 
 class Graph:
-    """Clients by number; topics, services and actions by absolute name."""
+    """The hub's ROS graph: clients by number; topics, services and actions by absolute name."""
 
     def __init__(self) -> None:
         self.clients: dict[int, Client] = {}

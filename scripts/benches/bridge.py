@@ -201,7 +201,7 @@ async def bench() -> int:
 
 
 def show(servers: dict[str, list[float]], found: Figures, drops: Drops) -> None:
-    """Print medians, and their ratios to those of the better transport of roslibpy."""
+    """Print each client's medians, and the ratio of ours to those of roslibpy's better transport."""
     columns = (OURS, CBOR, *THEIRS)
     rates = {name: statistics.median(each) for name, each in servers.items()}
     rows = []

@@ -61,7 +61,7 @@ def message(reading: dict[str, int]) -> dict[str, object]:
 
 
 def quantile(values: list[float], share: float) -> float:
-    """Return the quantile of the values."""
+    """Return a quantile of the values; `share` is 0.5 for the median."""
     return sorted(values)[min(len(values) - 1, int(share * len(values)))]
 
 

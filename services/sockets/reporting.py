@@ -123,7 +123,7 @@ class Report:
         manager.report(status.why, ready=status.ready, alive=self._is_alive())
 
     def status(self) -> ProcessStatus:
-        """Return the whole status."""
+        """Return the process's status, completed with what all processes report."""
         status, now, cpu_s = self._get_status(), time.monotonic(), time.process_time()
         alive = self._is_alive()
         frames = status.frames

@@ -212,7 +212,7 @@ class BM1Options:
 
 @dataclass(frozen=True, kw_only=True)
 class BM2Options:
-    """The flags of a build about a BM2."""
+    """The flags of a build that only a BM2 uses."""
 
     sequencer: Annotated[Sequencer, typer.Option(help="Order in which a BM2 samples the bits.")] = (
         Sequencer.LINEAR
