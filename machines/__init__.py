@@ -21,7 +21,7 @@ FAST_CODES_MAX: Final = 2**24
 
 
 def make_kernel(machine: "BM1Machine", *, boards: int = 1) -> "BM1Kernel":
-    """Return the fastest kernel that can run the machine; its cache has 1 / `boards` of the usual size."""
+    """Return the fastest kernel that can run the machine; the kernel's cache has 1 / `boards` of the usual size."""
     parameters = machine.parameters
     codes = parameters.columns << parameters.prob_bits
     if parameters.shared and parameters.rng.lfsr_bits is not None and codes <= FAST_CODES_MAX:

@@ -47,7 +47,7 @@ FACTOR_VARIABLES_MAX: Final = 32
 """Maximum number of variables of a factor: its array has an axis for each."""
 
 SEARCH_MAX: Final = 150_000
-"""Maximum work of the search for a start state, in units of its own; this much takes about a second."""
+"""Maximum number of steps in the search for a start state; they take about a second."""
 
 
 class BM2StopReason(IntEnum):
@@ -234,7 +234,7 @@ class BM2Parameters:
 
     @property
     def result_words(self) -> int:
-        """Number of words of all histograms, with that of the joint."""
+        """Number of words of all histograms, including the histogram of the joint."""
         return self.histogram_words + self.joint_words
 
     @property

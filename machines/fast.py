@@ -49,8 +49,8 @@ PREPARED_CYCLES: Final = 2**14
 class FastBM1(BM1Kernel):
     """A kernel for shared LFSRs that runs many cycles at a time (thesis 2.1.2 and 4.4).
 
-    Words are kept between frames (at most `kept_bytes`) if frames restart from a bank. Otherwise, or if not even a
-    block for every bank fits, each frame computes its own.
+    The words of random bits are kept between frames (at most `kept_bytes`) if each frame restarts the generators from
+    a bank. Otherwise, or if not even one block of every bank fits, each frame computes its own words.
 
     Raises:
         MachineError: The generators of the machine are not LFSRs, or are not shared.

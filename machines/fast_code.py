@@ -80,7 +80,7 @@ def store_of_codes(occurring: npt.NDArray[np.bool_], slots: int) -> _Store:
 
 
 def store_of_frame(occurring: npt.NDArray[np.bool_], cells: int, slots: int) -> _Store:
-    """Allocate words for the codes of a frame of `cells` cells; each frame assigns the rows again."""
+    """Allocate words for the codes of one frame of `cells` cells; each frame assigns its codes to rows anew."""
     none = np.zeros(min(int(occurring.sum()), cells), dtype=np.int64)
     return _store(np.full(occurring.shape, NO_ROW, dtype=np.int32), none, none, slots)
 

@@ -85,7 +85,7 @@ PARAMETERS: Final = "bm1_parameters.vhd"
 
 
 def in_order(sources: Sequence[Path | str], parameters: Path | str = PARAMETERS) -> list[str]:
-    """Return VHDL files in the order of analysis, with the package of parameters after the first."""
+    """Return VHDL files in the order of analysis: the package of parameters comes after the first of `sources`."""
     return [str(sources[0]), str(parameters), *map(str, sources[1:])]
 
 

@@ -67,7 +67,7 @@ def as_png(payload: bytes) -> bytes:
 
 
 def json_prefix(name: str) -> bytes:
-    """Return the bytes before the JSON of a message of topic `name`; a brace follows it."""
+    """Return the bytes before the JSON of a message of topic `name`; the closing brace after the JSON is not included."""
     return b'{"op":"publish","topic":"%b","msg":' % name.encode()
 
 

@@ -405,7 +405,7 @@ def _traffic(boards: Sequence[DrivenBoard]) -> tuple[int, int]:
 
 
 def _check_images(boards: int, images: Sequence[Image]) -> None:
-    """Raise an error for images that are not the parts of one model in order."""
+    """Raise an error unless the images are all parts of one model, in the order of the parts."""
     if boards != len(images) or not images:
         raise ImageMismatchError(f"There are {boards} endpoints for {len(images)} images; one each is needed")
     offset = 0

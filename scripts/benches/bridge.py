@@ -120,7 +120,7 @@ async def client(name: str, uri: str) -> AsyncIterator[Child]:
 
 
 async def published(child: Child, uri: str, topic: str, values: int, number: int) -> tuple[float, float, int]:
-    """Return the messages per second that arrive from the client, its CPU microseconds per message, and the drops."""
+    """Return the messages per second that arrive from the client, its CPU microseconds per message, and the losses."""
     async with bare(uri) as counter:
         counter.send(subscribe(topic, queue_length=1000))
         await settled(counter)

@@ -114,7 +114,7 @@ async def crowd(uri: str, hub: int, clients: int, seconds: float) -> list[Row]:
 
 
 class Attack(NamedTuple):
-    """The messages of an attacker: some sent once, some after each pause, some by twenty other connections."""
+    """An attacker: its message at the start, its message after each pause, and its other connections."""
 
     once: bytes = b""
     again: bytes = b""

@@ -49,7 +49,7 @@ BATCHES: Final = 64
 """Number of batches of samples in a run; the batches' means give the effective samples."""
 MAX_CYCLES: Final = 2**32
 LEAVES: Final = 3
-"""Maximum number of known variables in an evidence."""
+"""Maximum number of variables in a set of evidence."""
 POSSIBLE: Final = 1e-9
 """Least probability of an unlikely state, far above the rounding of exact inference."""
 
@@ -97,7 +97,7 @@ class Network:
         return {variable: inference.posterior(names[variable]).toarray() for variable in unknown}
 
     def evidences(self) -> dict[str, Known]:
-        """Return three evidences: none; the likeliest states of the first leaves; their least likely states.
+        """Return three sets of evidence: an empty one, the likeliest states of the first leaves, their least likely states.
 
         The state of each leaf depends on the leaves before it, so that all states are possible together.
         """

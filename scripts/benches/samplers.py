@@ -31,7 +31,7 @@ class Sampled:
     sweeps: int
     seconds: float
     effective: float = 0.0
-    """The smallest number of effective samples of a value."""
+    """The number of effective samples of the value that has the fewest."""
     cycles: int = 0
     stop: str = ""
     """The reason, if not all samples were drawn."""

@@ -47,7 +47,7 @@ class Visit:
     Attributes:
         page: Playwright's page.
         complaints: Errors on the console, uncaught exceptions, and requests to other computers.
-        may_lose_server: While the dashboard restarts, because the browser itself reports each failed request.
+        may_lose_server: Ignore the errors of failed requests; True while the dashboard restarts.
     """
 
     def __init__(self, page: Any) -> None:

@@ -212,7 +212,7 @@ class WatchedRobot:
     # The stack
 
     async def watch_stack(self, directory: Path) -> None:
-        """Read the status sockets of this machine until cancelled."""
+        """Read the status sockets of this computer until cancelled."""
         while True:
             status = await ask_stack(directory, shared=self._settings.run_directory is None)
             self.why = status.why

@@ -1,4 +1,4 @@
-"""The web server of the page, which runs in the event loop of this process and leaves signals to the process."""
+"""The web server of the dashboard: it runs in the event loop of this process, and handles no signals."""
 
 import asyncio
 import contextlib
@@ -25,7 +25,7 @@ _LOOK_EVERY: Final = 0.05
 
 
 class _Server(uvicorn.Server):
-    """A server that leaves signals to the process."""
+    """A server that handles no signals."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:

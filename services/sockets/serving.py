@@ -274,7 +274,7 @@ async def report_failure(link: Link, error: BaseException) -> None:
 
 
 def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None:
-    """Return an error if the folder now holds the deployment in the `refused` hello (a restart helps), or None."""
+    """Return an error that advises a restart if the folder now has the deployment of the `refused` hello, else None."""
     if not isinstance(refused, Hello) or refused.deployment_hash == deployment.hash:
         return None
     try:

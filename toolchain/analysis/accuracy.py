@@ -236,7 +236,7 @@ class _Reading(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Frames:
-    """The job of running the readings: piece n is the reading at index n; a frame has `replicas` readings."""
+    """The job of running the readings, one a piece: piece n runs reading n, which is one replica of frame n // `replicas`."""
 
     boards: EmulatedBoards
     readings: Readings
@@ -343,7 +343,7 @@ class _Counts:
     cycles: int
 
     def prepare(self) -> Work:
-        """Return the function that sums z^2, z, 1 and |z| > 3 over the counts of a reading: float64[4]."""
+        """Return the function that sums z^2, z, 1 and |z| > 3 over the z-scores of a reading's counts: float64[4]."""
 
         def compared(place: int) -> NDArray[np.float64]:
             boards, prior, cycles = self.boards, self.priors[place], self.cycles

@@ -261,7 +261,7 @@ class EqualMemories:
 
     @property
     def blocks(self) -> int:
-        """Minimum number of M20Ks for one of them."""
+        """Minimum number of M20Ks for one memory."""
         return blocks_of(self.words, self.width)
 
 

@@ -116,7 +116,7 @@ def record_layout(deployment: Deployment) -> "np.dtype[np.void]":
 
 @dataclass(slots=True)
 class PartFile:
-    """The records of a run, each at the place of its row in a file; some may be those of a run that was interrupted."""
+    """A file with one record per row of the recording; an interrupted run may have written some of the records."""
 
     file: int
     """The descriptor of the file."""

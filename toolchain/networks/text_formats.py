@@ -294,7 +294,7 @@ _OTHER_NODES: Final = {"continuous", "utility", "decision", "function"}
 
 
 def read_net(data: bytes, builder: NetworkBuilder) -> None:
-    """Read a NET file of discrete chance nodes; in `data`, parents are in order and the child is fastest."""
+    """Read a NET file of discrete chance nodes. In a table, the parents are in order, and the child varies fastest."""
     text = Scanner(data, builder.path, signs="{}()|;,=", comments=_NET_COMMENTS)
     in_class = False
     while (block := text.next()) or text.quoted:

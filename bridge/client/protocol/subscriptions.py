@@ -336,7 +336,7 @@ class Subscriptions:
         return known.subscribed.measure(known.topic, len(data)) if known is not None and is_usable else None
 
     def forget_envelopes(self) -> None:
-        """Forget the known envelopes, because subscriptions or the server have changed."""
+        """Forget the known envelopes of messages, because subscriptions or the server have changed."""
         self.envelopes.clear()
         self._known = _UNKNOWN
         for subscribed in self._subscribed.values():

@@ -158,7 +158,7 @@ def flaw_of(picture: "Image.Image", grid: dict[str, Any], pose: dict[str, Any]) 
 
 
 def draw(last: dict[str, Any]) -> None:
-    """Draw the decoded topics that rviz does not show."""
+    """Draw the topics that rviz does not show, from their `last` messages."""
     from matplotlib.figure import Figure
 
     counts = last["/bm/counts"]
