@@ -53,7 +53,7 @@ class Case:
     publishers: Mapping[str, Sequence[str]]
     """The commands on the robot's side with their options, in the order of their start."""
     counts_frames: bool = True
-    """True if the viewer shows each of the master's frames; the demo then ends the master by `--count` as well."""
+    """True if the viewer shows all of the master's frames; then the demo gives `--count` to the master as well."""
 
 
 def boat(rates: Sequence[str], clock: float, *, array: bool) -> Case:

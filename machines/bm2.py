@@ -305,8 +305,8 @@ class BM2Machine(MachineContents):
 
     Attributes:
         parameters: Variables, factors, widths and generators.
-        tables: For each CDE, whose factor has n bits, a uint16[n * 2**(n - 1)]: the probability code with which bit j
-            of the factor is drawn is at j * 2**(n - 1) + v, where v consists of the other n - 1 bits, in rising order.
+        tables: For each CDE, whose factor has n bits, a uint16[n * 2**(n - 1)]: entry j * 2**(n - 1) + v is the
+            probability code with which bit j is drawn if the other n - 1 bits, in rising order, have the value v.
         supports: One bool[cardinalities of the variables] per factor: True where the factor is not 0.
         rng_table: uint32[length], the random numbers for all CDEs if `rng` is `table`; otherwise None.
 

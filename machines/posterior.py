@@ -1,4 +1,4 @@
-"""Posteriors from counts: over all boards of a model, and in one call for a notebook."""
+"""Posteriors from the counts of all boards of a model, and `posterior`, which first runs the machines."""
 
 from collections.abc import Sequence, Sized
 from typing import TypeAlias, cast

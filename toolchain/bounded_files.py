@@ -248,7 +248,7 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 def _followed(
     model: type[BaseModel], place: Sequence[str | int]
 ) -> tuple[list[str | int], list[type[BaseModel]]]:
-    """Follow a place through models; return the place without types of sections, and the models at its end."""
+    """Follow a validation error's place through models; return it without section types, and the models at its end."""
     followed: list[str | int] = []
     models = [model]
     for step in place:

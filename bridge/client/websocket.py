@@ -199,7 +199,7 @@ class WebSocket(WebSocketTransport):
             self.abort()  # a peer with another protocol may never close the connection
 
     def connection_ended(self, exc: Exception | None) -> None:
-        """Wake `handshake`, or call `on_lost` after `begin`."""
+        """Wake `handshake` if it still waits; once `begin` has been called, call `on_lost`."""
         self._answered.set()
         self._cancel_watchdog()
         if self.opened:

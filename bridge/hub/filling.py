@@ -26,7 +26,7 @@ _Parts = tuple[tuple[str, "Filler", bool], ...]
 """The fields of a message that are messages or arrays of messages: name, filler, and whether it is an array."""
 
 _Absent = tuple[dict[str, Any], bytes, _Parts]
-"""A message's absent fields with their defaults, not to be changed; the JSON of these (the tail); its present parts."""
+"""Of a message: absent fields with their defaults (read-only), the JSON of the defaults, and the parts present."""
 
 
 class Filler:

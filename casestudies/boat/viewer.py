@@ -1,4 +1,4 @@
-"""Viewer of the boat's posteriors next to its true positions, from the topics of both and of frame reports."""
+"""Viewer of the boat's posteriors, true positions and frame reports, received from the three topics."""
 
 import math
 from collections import deque

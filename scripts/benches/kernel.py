@@ -144,7 +144,7 @@ def in_pyagrum(pyagrum: Any, joint: JointDistribution) -> Any:
 def alternatives(
     pyagrum: Any, joint: JointDistribution, known: Known, arguments: argparse.Namespace
 ) -> dict[str, Callable[[], Sampled]]:
-    """Return, for each alternative, a function that runs it once and measures its processor time."""
+    """Return, for each sampler to compare, a function that runs it once and measures its processor time."""
     model = joint.ask(joint.symbols).network()
     machine = machine_of(model, Sequencer.LINEAR)
     parameters = machine.parameters

@@ -69,7 +69,7 @@ class Fitted(NamedTuple):
 
     @property
     def is_right(self) -> bool:
-        """True if the rate is the stated one within the tolerance."""
+        """True if the fitted rate agrees with the emulated wire's rate (`WIRES`) within `TOLERANCE`."""
         return abs(self.mbps / WIRES[self.link].mbps - 1) <= TOLERANCE
 
 

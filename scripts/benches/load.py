@@ -33,7 +33,7 @@ PROBE_HZ = 100
 LIMIT = 24 * 3600.0
 """Time limit in seconds, beyond any sensible `--minutes`."""
 WARM_UP = 200
-"""Readings before the first minute."""
+"""Number of readings before the first measured minute."""
 
 
 @dataclass

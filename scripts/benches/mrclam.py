@@ -50,8 +50,8 @@ def unquantised_posterior(
 ) -> NDArray[np.float64]:
     """Return the posterior over the cells, float64[width * height] with line = y * width + x.
 
-    There is one reading for each landmark, in the same order. The density of outliers is the floor everywhere,
-    relative to the peak. Without a floor, readings that are impossible on every line raise a ModelError.
+    There is one reading for each landmark, in the same order. `floor` is the density of outliers, equal everywhere,
+    as a share of the normal's peak. If it is 0, readings that are impossible on every line raise a ModelError.
     """
     grid = area_grid(width, height)
     rows = grid.y_low + (np.arange(height) + 0.5) * grid.cell_height

@@ -1,4 +1,4 @@
-"""Gibbs samplers of other projects, for comparison: pyAgrum's, and THRML's blocks on JAX."""
+"""Gibbs samplers of other projects, for comparison: that of pyAgrum, and THRML's block sampler on JAX."""
 
 import time
 from collections.abc import Mapping, Sequence

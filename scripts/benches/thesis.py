@@ -1,4 +1,4 @@
-"""The cycle if subscriber and publisher start for each message (probably as in the thesis), and if they start once.
+"""The cycle time with a subscriber and publisher started for each message (as probably in the thesis), or only once.
 
 client --reading--> hub --> subscriber -> master -> pcie-app -> 4 boards -> pcie-app -> master -> publisher --> hub --> client
                             `-- started for each message, or once ------------------------------'

@@ -70,7 +70,7 @@ SHORT: tuple[Step, ...] = (
 # --- what a fault explains -------------------------------------------------------------------
 
 ENDS = {"master": 1, "hub": 2, "boards": 3}
-"""Maximum ends of a role per round; 3 for boards, because a board's fourth failure in a minute ends the master."""
+"""How often faults may end a role in a round: boards 3 times, as a board's 4th failure in a minute ends the master."""
 MOST_ENDS = 2
 """The same maximum for each role that is not in `ENDS`, and for the roles' connections to the master."""
 _ENDS_LINK = {"kill", "corrupt", "repeat", "cut", "finish", "cut-inside", "memory"}

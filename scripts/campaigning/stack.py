@@ -46,7 +46,7 @@ class Topology(StrEnum):
 
     @property
     def apart(self) -> bool:
-        """True if the campaign starts the boards, instead of the master."""
+        """True if the campaign, not the master, starts the boards."""
         return self in {Topology.APART, Topology.FUSED_APART}
 
     @property

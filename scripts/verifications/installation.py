@@ -21,7 +21,7 @@ LIMIT: Final = 600.0
 """Time limit of one installer, in seconds."""
 PIP: Final = ("-m", "pip", "-q", "--disable-pip-version-check")
 PINNED: Final = ("--no-deps", "--require-hashes", "--only-binary", ":all:")
-"""Flags for wheels of a lock file."""
+"""Flags with which pip installs only the wheels of a lock file."""
 
 
 def run(*command: str | Path, cwd: Path | None = None) -> None:

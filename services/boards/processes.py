@@ -1,4 +1,4 @@
-"""Processes of emulated boards: a single one, or a mini-cluster forked from a process with loaded kernels."""
+"""Processes of emulated boards: a single one, or a mini-cluster forked from a process with the compiled code."""
 
 import asyncio
 import os

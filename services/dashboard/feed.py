@@ -101,7 +101,7 @@ class Feed:
     Attributes:
         frames: The last frames, at most `KEPT_FRAMES`.
         truth: The newest true position (x, y) of the simulated robot; None if there is none.
-        watchers: Functions called at each change. They may only record it, because it is not complete yet.
+        watchers: Functions called during each change; they may only note that there is one, as it is incomplete.
         lost: Number of frames without a posterior by reason, at most `_MAX_REASONS` of them.
     """
 

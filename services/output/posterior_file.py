@@ -228,7 +228,7 @@ class _Archive(ResultFile):
             raise self._error("it cannot be written: the folder is not writable")
 
     def add(self, frame: FrameOutcome, axes: list[Axis]) -> None:
-        """Add one posterior, except for a frame without one."""
+        """Add the posterior of the frame, if it has one."""
         if not isinstance(frame, Posterior):
             return
         if not self._axes:

@@ -142,7 +142,7 @@ class Publisher(RunService):
             await asyncio.sleep(CHECK_INTERVAL)
 
     async def _keep_looking(self) -> NoReturn:
-        """In each run with `--loop`, check whether the server passes results on, since some servers do not."""
+        """Check in every run of a loop (`--loop`) whether the server passes results on, since some servers do not."""
         while True:
             await self._first.wait()
             self._first.clear()

@@ -18,7 +18,7 @@ from toolchain.deployment import Deployment, Source
 
 
 async def print_variables(settings: Settings, source: Source, names: list[str], count: int | None) -> int:
-    """Print the named variables in each message of a topic, or whole messages without names.
+    """Print the named variables in each message of a topic; if `names` is empty, print whole messages.
 
     Raises:
         NoMessageError: No message came in time.

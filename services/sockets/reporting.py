@@ -93,8 +93,8 @@ class ServiceManager:
 class Report:
     """The status of a process with its identity, rate, CPU time, memory and latencies.
 
-    `is_alive` returns whether the process makes progress, if its answers alone do not prove that. `stages` returns
-    the latencies of the stages of its frames.
+    `is_alive` returns whether the process makes progress; it is needed only if an answer does not prove that.
+    `stages` returns the latencies of the stages of the process's frames.
     """
 
     def __init__(

@@ -189,7 +189,7 @@ class ChainError:
     worst: float
     """The largest distance of the stationary law from exact inference, over readings."""
     worst_reading: tuple[int, ...]
-    """The reading with this distance: an address per known variable."""
+    """The reading with the largest distance (`worst`): an address per known variable."""
     start: float
     """Mean distance of a frame's mean law from the stationary law: the effect of the start that burn-in leaves."""
     sampling: float

@@ -150,7 +150,7 @@ def inspect_chain(
 
 
 def check_same(deployment: Deployment, machine: BM2Machine, model: NetworkModel) -> None:
-    """Raise a BuildError if the model would not build the deployment's machine (whose codes may be edited)."""
+    """Raise a BuildError if the model would not build the deployment's machine; edited codes are not compared."""
     p = machine.parameters
     place = {name: at for at, name in enumerate(model.names)}.__getitem__
     scopes = tuple(tuple(map(place, term.scope)) for term in model.factors)

@@ -88,7 +88,7 @@ class Of(StrEnum):
     WORD = "word"
     """A word that the host writes for a frame, in bm1_words: its logic decodes the address and checks the value."""
     MEMORY = "memory"
-    """A memory of words that the host writes, in bm1_words: its initial contents and its output."""
+    """A whole memory of the words that the host writes, in bm1_words: the logic that fills it at first and reads it."""
     REPLICA = "replica"
     """One of several replicas, in bm1_control and bm1_readout: its stop, stop reason, resume and outcome."""
 
@@ -314,7 +314,7 @@ def word_memories_of(p: BM1Parameters, inputs: int = 0) -> list[EqualMemories]:
 def place_memories(
     parameters: BM1Parameters, device: Device, table_length: int = LENGTH, inputs: int = 0
 ) -> Memories:
-    """Place tables, the deepest first, in the blocks that the other memories leave, and the rest in memory LABs."""
+    """Place tables, the deepest first, in the M20Ks that other memories leave free; place the other tables in MLABs."""
     tables = tables_of(parameters)
     room = math.floor(device.usable * device.blocks)
     others = random_memories_of(parameters, table_length) + word_memories_of(parameters, inputs)

@@ -170,7 +170,7 @@ def _machine_answer(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contents:
-    """The variables of a network and, if some are searched, the pairs that cannot both be known variables of a BM1."""
+    """A network's variables and, if some are searched, those pairs of others of which a BM1 can know only one."""
 
     joint: JointDistribution
     searched: tuple[str, ...] = ()

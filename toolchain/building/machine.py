@@ -29,7 +29,7 @@ _MOST_CODES: Final = 1 << 30
 MACHINE_KEYS: Final = tuple(
     key for key in BM1Section.model_fields if key in BM1Parameters.__dataclass_fields__ and key != "lines"
 )
-"""The parameters that `[machine]` of `deployment.toml` has too, except `lines`, which the file has for all boards."""
+"""Fields of BM1Parameters that are also keys of `[machine]`, except `lines`, whose key counts all boards' lines."""
 
 
 def machine_options(source: BuildOptions | MachineSection, keys: Iterable[str]) -> dict[str, Any]:

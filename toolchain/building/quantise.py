@@ -1,9 +1,9 @@
 """Quantising: conversion of probabilities to codes of W bits, after scaling, and what is lost by it.
 
-A factor that is the same for all lines does not change the posterior, so by default every row of a column's table (an
-address, which is a value of the variable) is divided by its maximum over all lines of all boards. Otherwise a machine
+A factor that is the same for all lines does not change the posterior, so by default every row of a column's table (the
+likelihoods of one value of the variable) is divided by its maximum over all lines of all boards. Otherwise a machine
 would rarely count. An outlier floor is a small probability that a model gives to every value, so that no single outlier
-excludes the true line; if the code of the floor becomes 0, an outlier does.
+excludes the true line. If the floor is so small that its code is 0, one outlier excludes it.
 """
 
 import math

@@ -94,7 +94,7 @@ def chain_findings(chain: CheckedChain) -> Iterator[Finding]:
 
 
 def _clips(chain: CheckedChain) -> Iterator[Finding]:
-    """Find every clipped factor; without the model, only factors that are clipped because of zeros."""
+    """Find the factors with clipped odds; without the model, only zeros are known, so other clipping is not found."""
     width, model = chain.machine.parameters.prob_bits, chain.model
     for at, (title, support) in enumerate(zip(chain.titles, chain.machine.supports, strict=True)):
         clips, zeros, count = clipped(

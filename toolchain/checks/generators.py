@@ -189,7 +189,7 @@ def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> tuple
 def _bit_words(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> NDArray[np.uint64]:
     """Return one word per bit of the random numbers, uint64[groups, bits]: its values in the generators' first steps.
 
-    There are as many steps as a state has bits, which determine all later ones: bits with equal words always agree.
+    A word has as many steps as a state has bits. These determine all later steps: bits with equal words always agree.
     """
     lfsr = LFSR(kind)
     shifts = np.arange(prob_bits, dtype=np.uint64)

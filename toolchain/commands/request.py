@@ -170,7 +170,7 @@ def _case_source(path: Path, flags: ModelFlags, settings: dict[str, str]) -> "Mo
 def build_options(
     flags: BuildFlags, target: TargetOptions, sources: Path | None = None, *, is_checked: bool = False
 ) -> BuildOptions:
-    """Return the options of a build; `sources` is a file that assigns variables to topics, instead of one topic.
+    """Return the options of a build; the file `sources` names several topics, in place of one in flags.
 
     With `is_checked`, the flags that name the topic of the readings may be missing.
     """
@@ -210,7 +210,7 @@ def build_options(
 
 
 def fit_to_device(plan: "MachinePlan", name: str | None) -> tuple["MachinePlan", str]:
-    """Return the plan with enough boards of device `name` (full ones for `--replicas fill`), and sentences why."""
+    """Return the plan with enough boards of device `name` (with `--replicas fill`, full boards), and the reasons."""
     if name is None:
         return plan, ""
     from toolchain.analysis.logic import device_named

@@ -282,7 +282,7 @@ class Question:
         return None
 
     def dependent(self) -> list[tuple[str, str]]:
-        """Return the pairs of known symbols that are dependent given the searched ones; a BM1 can know only one."""
+        """Return the pairs of known symbols that are dependent given the searched ones; a BM1 can know one of each."""
         factors, pairs = self._pairs()
         return [
             (one, other) for _, one, other in pairs if self._linked(factors, [one, other])[1].path(one, other)

@@ -66,7 +66,7 @@ class TabulatedVariable:
     name: str
     """The variable's name: the field in the message, unless `path` is given."""
     table: NDArray[np.float64] = field(repr=False)
-    """float64[values, lines]; row k is address k."""
+    """float64[values, lines]; row k is for the reading with address k."""
     bits: int = 0
     """Address bits; 0 for the fewest that suffice for the values and the top address, which means a missing reading."""
     offset: float = 0.0
