@@ -120,7 +120,7 @@ class BM1Kind(MachineKind):
         return make_kernel(machine)
 
     def on_board(self, kernel: BM1Kernel, memory: Mapping[str, memoryview]) -> BoardMachine:
-        """Return a kernel behind the registers of a board."""
+        """Return the kernel as a board's machine, whose inputs and results are in `memory`, the board's registers."""
         return _OnBoard(kernel, memory)
 
     def on_host(self, machines: Sequence[BM1Machine]) -> HostMachine:

@@ -89,7 +89,7 @@ class Chains:
         """Run a frame of every chain to its stop; this is fast if the starts differ only in `state` and `bank`.
 
         Raises:
-            StartError: There is not one start for each chain, or one does not fit; no chain has run.
+            StartError: The numbers of starts and chains differ, or a start does not fit; no chain has run.
         """
         if len(starts) != len(self._machines):
             raise StartError(f"There are {len(starts)} starts for {len(self._machines)} chains.")

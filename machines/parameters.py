@@ -203,7 +203,7 @@ class BM1Parameters:
 
     @property
     def ones_code(self) -> int:
-        """The all-ones code, which always makes a one."""
+        """The code whose bits are all 1: a cell with this code makes a 1 in every cycle."""
         return (1 << self.prob_bits) - 1
 
     @property

@@ -147,7 +147,7 @@ def serve_board(
 
 
 class BoardServer:
-    """The loop over the stop signal, two listening sockets, a host and a loader."""
+    """The loop that waits for the stop signal, new connections at both ports, and data from the host and the loader."""
 
     def __init__(
         self, endpoint: Endpoint, index: int, stop: StopSignal, board: Board, link: LinkModel | None = None

@@ -167,7 +167,7 @@ def read(url: str) -> None:
 
 
 async def cycles(plain: Stand, beside: Stand, frames: int, seed: int) -> Rows:
-    """Compare the cycle times of two stacks, measured in short turns; only one has a dashboard, with a reader."""
+    """Compare the cycle times of two stacks, measured in short turns; only `beside` runs a dashboard and its reader."""
     async with connect(plain.uri) as one, connect(beside.uri) as other:
         # a process of its own, as a browser is
         reader = multiprocessing.get_context("spawn").Process(target=read, args=(beside.url,), daemon=True)

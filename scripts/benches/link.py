@@ -44,9 +44,9 @@ RESULTS = 4096
 WAYS = {"sent": (), "read": ("--read-results",)}
 """Flags of `board` by the way in which results arrive: in the done message, or by register reads as in the thesis."""
 SLOWER = 20
-"""Measurements of every other link for each one over JTAG, because a transfer over JTAG takes milliseconds."""
+"""JTAG is measured once for so many measurements of each other link, because its transfers take milliseconds."""
 TOLERANCE = 0.15
-"""Deviation of a fitted rate from the stated one that the bench accepts."""
+"""Maximum relative deviation of a fitted rate from the stated one."""
 LIMIT_S = 30.0
 
 SIZES = tuple(4 * words for words in WORDS)

@@ -449,7 +449,7 @@ async def robot(stand: Server, received: Received, sent: list[Sent]) -> AsyncIte
 
 
 def readings_of(column: int, row: int) -> list[float]:
-    """Return the sensors' readings at a cell's centre without noise, in the order of the machine's columns."""
+    """Return the noiseless readings of the sensors at a cell's centre, in the order of the machine's columns."""
     width = (MAP_HIGH - MAP_LOW) / SIZE
     x, y = (MAP_LOW + width * (index + 0.5) for index in (column, row))
     return list(map(float, readings_at(x, y).values()))

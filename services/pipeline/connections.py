@@ -125,7 +125,7 @@ class AdvertisedTopic:
 
 
 def reported_refusals(topics: Iterable[AdvertisedTopic]) -> dict[str, str]:
-    """Return why topics cannot be received, by topic, if a server reports that it refused them."""
+    """Return, by topic, why topics cannot be received: those that a server has reported to have refused."""
     return {
         topic.name: f"{topic.name} cannot be received at {topic.uri}: {shown(status.text[:200])}; {_way_out(topic)}"
         for topic in topics

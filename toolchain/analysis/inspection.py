@@ -36,7 +36,7 @@ SLOW_FRAMES: Final = 20
 """Number of frames for machines that are slow to emulate: with one generator per cell, or without LFSRs."""
 LEAST_FRAMES: Final = 20
 SLOW_LEAST_FRAMES: Final = 3
-"""Minimum number of frames for slow machines with replicas, by whose number `SLOW_FRAMES` is divided."""
+"""Minimum number of frames for slow machines with replicas; `SLOW_FRAMES` is divided by the number of replicas."""
 SLOW_BANKS: Final = 1
 
 

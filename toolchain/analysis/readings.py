@@ -182,7 +182,7 @@ def _conditional(codes: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _distribution(ratios: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return ratios, normalised to the sum 1 (also those of a model, whose sum is 1 only within 1e-6)."""
+    """Return ratios, normalised to the sum 1, because even a model's probabilities have it only within 1e-6."""
     total = ratios.sum()
     return ratios / total if total > 0 else np.full(ratios.shape, 1 / ratios.size)
 

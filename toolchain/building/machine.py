@@ -129,8 +129,8 @@ def plan_machine(model: Model, options: BuildOptions) -> MachinePlan:
 def _filter_options(options: BuildOptions) -> BuildOptions:
     """Return the options for the machine of a filter, which needs a written prior, or raise a BuildError.
 
-    The default is codes of 16 bits: with 8 bits, the least code that a prediction can have is too large, and on 400
-    lines triples the error of the posteriors.
+    By default, codes have 16 bits: with 8 bits, the smallest code of a prediction stands for too large a probability,
+    and the error of the posteriors triples on 400 lines.
     """
     if options.written_prior is not None:
         flag = "--prior-path" if options.sources is None else f"the prior in {options.sources.toml.path}"

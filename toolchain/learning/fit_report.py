@@ -151,7 +151,7 @@ def _posteriors(
 
 
 def _scores(model: Model, truth: TrueCells, found: Sequence[NDArray[np.float64] | None]) -> Iterator[str]:
-    """Yield accuracy, distance and surprise; the distance is only over dimensions without names of states."""
+    """Yield accuracy, distance and surprise; the distance leaves out dimensions whose values are names."""
     lines = truth.lines.tolist()
     right = sum(
         each is not None and int(each.argmax()) == line for each, line in zip(found, lines, strict=True)

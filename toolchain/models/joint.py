@@ -289,7 +289,7 @@ class Question:
         ]
 
     def _linked(self, active: Sequence[Factor], observed: Sequence[str]) -> tuple[list[Factor], Links]:
-        """Return the factors relevant for some observed symbols, and the links between symbols that are not fixed."""
+        """Return the factors relevant for some observed symbols, and their links, cut at searched and given symbols."""
         cut = {*(symbol.name for symbol in self.searched), *self.given}
         factors = relevant(active, cut | set(observed))
         return factors, Links(factors, cut)
