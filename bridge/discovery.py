@@ -135,7 +135,7 @@ async def resolve(name: str, timeout: float = _TIMEOUT) -> str:
 
 
 async def announced_uri(uri: str, timeout: float = _TIMEOUT) -> str:
-    """Return a URI unchanged, but for `robot:NAME` the URI of that robot's server; errors as for `resolve`."""
+    """Return the server's URI for `robot:NAME`, and any other URI unchanged; raise the errors of `resolve`."""
     return await resolve(uri.removeprefix(ROBOT), timeout) if uri.startswith(ROBOT) else uri
 
 

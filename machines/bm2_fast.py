@@ -186,7 +186,7 @@ def warm_up() -> None:
 
 
 def row_size(parameters: BM2Parameters) -> int:
-    """Return how many random numbers are stored for each CDE: a block (32 for each bit of the LFSR) and a chunk."""
+    """Return how many random numbers are stored for each CDE: a block of LFSR bits * `CHUNK`, and `CHUNK` more."""
     return (POLYNOMIALS[parameters.rng][0] + 1) * CHUNK
 
 

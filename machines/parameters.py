@@ -219,7 +219,7 @@ class BM1Parameters:
 
 
 def set_choices(parameters: object, **kinds: type[StrEnum]) -> None:
-    """Convert the parameters that `kinds` names to members of these enumerations, or raise a ParameterError."""
+    """Convert each parameter that is a keyword in `kinds` to its enumeration, in place, or raise a ParameterError."""
     for name, kind in kinds.items():
         given = getattr(parameters, name)
         try:

@@ -61,7 +61,7 @@ class Job(Protocol):
 
 
 Run: TypeAlias = Callable[[Job, Sequence[int], Keep], None]
-"""A function that does the pieces of a job with these numbers, and calls `keep` with each result at once."""
+"""A function that computes the pieces with the given numbers, and passes each result to `keep` when it is there."""
 
 
 def in_this_process(job: Job, numbers: Sequence[int], keep: Keep) -> None:

@@ -19,7 +19,10 @@ HEADING: Final = "pair  host (ms)  pairs/s  projected/s    cycles  bad float64  
 
 
 def most_probable(posterior: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return pixels' most probable disparities, of float64[disparities, height, width]; `UNKNOWN` where all are 0."""
+    """Return each pixel's most probable disparity; `UNKNOWN` if all its probabilities are 0.
+
+    `posterior` is float64[disparities, height, width].
+    """
     return np.where(posterior.any(axis=0), posterior.argmax(axis=0), UNKNOWN)
 
 

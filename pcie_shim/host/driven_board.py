@@ -232,7 +232,11 @@ class DrivenBoard:
         link.post(writes)
 
     def receive(self) -> bool:
-        """Receive once, after a poll; return whether the board is done. A LinkError also for a wrong answer."""
+        """Receive once, after a poll; return whether the board is done.
+
+        Raises:
+            LinkError: The link failed, or the board answered twice, or with a number other than the doorbell's.
+        """
         link = self.open_link
         done = link.receive_done()
         is_done = done is not None

@@ -54,8 +54,9 @@ def lost_frames(plan: MachinePlan, quantised: Quantised) -> LostFrames:
     chances = _chances(plan, quantised, drawn)
     share = _share(chances, plan.options, plan.max_cycles)
     what = (
-        f"{share:.1%} of frames get no posterior, as computed from the codes for {frames} frames drawn from the model: in "
-        f"{(chances == 0).mean():.1%} every line has a code 0, in the others no line counts in {plan.max_cycles} cycles"
+        f"{share:.1%} of {frames} frames drawn from the model get no posterior, as computed from the codes: in "
+        f"{(chances == 0).mean():.1%} of all frames every line has a code 0, and in the rest of the {share:.1%} no line "
+        f"counts in {plan.max_cycles} cycles"
     )
     return LostFrames(share, what, _advice(plan, drawn) if share > TOLERATED else "")
 

@@ -88,8 +88,11 @@ def build_deployment(
     """Write a deployment: `deployment.toml`, an image per board, a report, and the hardware project.
 
     The same plan gives the same bytes. A deployment in the folder is replaced. `remarks` returns sentences to
-    add to the report. A BuildError if the options contradict the register map, if the folder cannot be written, or if
-    it has files with the names of a deployment's, but no deployment.
+    add to the report.
+
+    Raises:
+        BuildError: The options contradict the register map, or the folder cannot be written, or it has no deployment,
+            but files that the build would overwrite or remove.
     """
     built = assemble(plan)
     for remark in remarks(built):

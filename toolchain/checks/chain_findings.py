@@ -225,7 +225,10 @@ def legal_states(machine: BM2Machine) -> NDArray[np.bool_]:
 def unconnected(
     machine: BM2Machine, legal: NDArray[np.bool_], known: Sequence[int]
 ) -> tuple[int, int] | None:
-    """Return two legal states with the same known values between which no moves lead through legal states, or None."""
+    """Return two legal states that no series of moves through legal states connects, or None if there are none.
+
+    Both states have the same known values.
+    """
     p, index = machine.parameters, np.arange(len(legal))
     mask = sum(p.masks[variable] for variable in known)
     # the label of a state is the smallest state found to be connected to it; illegal states pass no labels on

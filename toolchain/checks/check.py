@@ -177,7 +177,7 @@ def _ranges(deployment: Deployment) -> Iterator[Finding]:
 
 
 def state_findings(variable: Variable) -> Iterator[Finding]:
-    """Find numbers and bools which, as readings, select another state than their sender probably means."""
+    """Warn if a reading that is sent as a number or a bool selects another state than its sender probably means."""
     states, shown = variable.states, ", ".join(variable.states[:_MOST_NAMES])
     for at, name in enumerate(states):
         number = variable.offset + at * variable.step

@@ -112,7 +112,7 @@ class TabulatedVariable:
 
 
 def checked_variable(*, name: str, **rule: Any) -> Variable:
-    """Return a known variable as in `deployment.toml`, or raise a ModelError."""
+    """Return a variable's entry of `deployment.toml`, or raise a ModelError if it would be invalid."""
     try:
         return Variable(name=name, **rule)
     except ValidationError as reason:

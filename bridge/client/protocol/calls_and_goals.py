@@ -212,9 +212,9 @@ class ServedServices(_Served):
     def answer(self, ticket: int, values: Mapping[str, Any] | str, *, ok: bool = True) -> None:
         """Answer a request with fields, or with a reason as text if `ok` is False; no effect after a lost connection.
 
-        The reference server drops an answer whose `values` are not an object, and the caller waits for ever
-        (rosbridge_library/capabilities/service_response.py, `service_response_msg_fields`), so the text is sent in an
-        additional field, which that server ignores and `bridge.hub` passes on.
+        A reason is sent in an additional field `reason`, and `values` stays an empty object: the reference server drops
+        an answer whose `values` is a text (rosbridge_library/capabilities/service_response.py,
+        `service_response_msg_fields`), and its caller waits for ever. `bridge.hub` passes the reason on.
 
         Raises:
             EncodeError: The values cannot be encoded as JSON; the request is still pending.
