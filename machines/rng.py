@@ -228,7 +228,7 @@ def map_tables(images: Words) -> Words:
 
 
 def apply_map(tables: Words, states: Words) -> Words:
-    """Return the images of states under a linear map."""
+    """Apply a linear map to states, and return the results."""
     images = np.zeros_like(states)
     for byte, table in enumerate(tables):
         images ^= table[(states >> np.uint64(8 * byte)) & np.uint64(255)]

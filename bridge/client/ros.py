@@ -182,7 +182,7 @@ class Ros:
             topic: Name of the topic.
             type: Type of the messages; None for any. Without a type, the subscription is repeated every two
                 seconds until a message arrives, because servers drop subscriptions to unknown topics.
-            throttle_rate: Minimum number of milliseconds between two messages; the server drops others.
+            throttle_rate: Minimum number of milliseconds between two messages; the server drops those in between.
             queue_length: Number of throttled messages that the server queues.
             queue_size: Maximum number of messages queued here; then the oldest is dropped and counted.
             compression: `cbor` for long arrays in a tenth of the time of JSON, `cbor-raw` for only the

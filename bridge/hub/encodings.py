@@ -36,7 +36,7 @@ _NONE, _PNG, _, _CBOR_RAW = ENCODINGS
 
 
 def encoding_of(requested: object) -> Encoding:
-    """Return the requested encoding; an unknown one is plain JSON, as on the reference server."""
+    """Return the requested encoding, or plain JSON if it is unknown, as on the reference server."""
     return next((known for known in Encoding if known == requested), Encoding.NONE)
 
 

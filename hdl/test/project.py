@@ -1,4 +1,4 @@
-"""Names from the rest of the project for the verification of the hardware.
+"""Imports from the rest of the project, for the verification of the hardware.
 
 Only this module imports machines, their emulation, the emulated board and the toolchain.
 """

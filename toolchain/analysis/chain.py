@@ -191,7 +191,7 @@ class ChainError:
     worst_reading: tuple[int, ...]
     """The reading with the largest distance (`worst`): an address per known variable."""
     start: float
-    """Mean distance of a frame's mean law from the stationary law: the effect of the start that burn-in leaves."""
+    """Mean distance of a frame's mean law from the stationary law: the effect that the start has after burn-in."""
     sampling: float
     """Mean distance of a frame's posterior from its expected value, because samples are finite and correlated."""
     cycles: float

@@ -39,7 +39,7 @@ _MOST_CYCLES: Final = 2**26
 
 
 class LostFrames(NamedTuple):
-    """The expected share of lost frames, a clause about them, and advice on losing fewer; empty if few are lost."""
+    """The expected share of lost frames, a clause about them, and advice on losing fewer (empty if few are lost)."""
 
     share: float
     what: str

@@ -78,7 +78,7 @@ def regenerate_memories(
     flags: ModelSection | None = None,
     build_date: str = "",
 ) -> Changes:
-    """Write the memory files and a BM1's `bm1_parameters.vhd` again, from the images or, with new tables, from a model.
+    """Write the memory files and a BM1's `bm1_parameters.vhd` again: from the images, or with new tables from a model.
 
     With a model, which was read with `flags`, the images (dated `build_date`), the report and the hashes of
     `deployment.toml` are written too, and the columns get the order of the model. Sizes, widths, topics and the paths

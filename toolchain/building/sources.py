@@ -32,7 +32,7 @@ class SourcesTables(Section):
 
 @dataclass(frozen=True, slots=True)
 class SourcesFile:
-    """A sources file: its valid tables, and its TOML text, which locates mistakes."""
+    """A sources file: its valid tables, and its TOML text, in which mistakes are located."""
 
     toml: TomlFile
     tables: tuple[SourceTable, ...]

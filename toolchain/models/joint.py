@@ -45,7 +45,7 @@ class JointDistribution:
     """A product of factors: a Bayesian network or, with potentials, a Markov network."""
 
     name: str
-    """The name for deployments."""
+    """The name of the model in deployments."""
     factors: tuple[Factor, ...]
     """The distributions P(A | B, C) and the potentials. Parents such as B and C have a factor of their own."""
     symbols: tuple[Symbol, ...] = field(init=False, repr=False)
