@@ -42,7 +42,7 @@ Result = TypeVar("Result")
 
 
 class Posteriors:
-    """A subscription to the posteriors of a stack that publishes on this server, read by one task with `async for`.
+    """A subscription to the posteriors of a stack on the client's server, read by one task with `async for`.
 
     A lost connection does not end the iteration: it continues after the reconnection. Closing this object (`async
     with`, before the client is closed) or the client ends it. If the reader is too slow, the oldest posteriors are

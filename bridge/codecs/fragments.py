@@ -57,7 +57,7 @@ class _Set:
 
 
 class Reassembler:
-    """Reassembly of the messages of one connection. The caller reads the clock."""
+    """Reassembly of the messages of one connection; callers pass the present time."""
 
     def __init__(self, *, max_size: int = MAX_SIZE) -> None:
         """Start without fragments.

@@ -271,7 +271,7 @@ def _all_finite(value: Any) -> bool:
 
 
 def envelope_of(data: bytes) -> bytes:
-    """Return everything up to an operation's first key `msg`, which may be its envelope; empty without that key."""
+    """Return the bytes up to the first key `msg` of an operation: its envelope, probably. Without that key return none."""
     key = _KEY if data[:1] < b"\x80" else _CBOR_KEY
     at = data.find(key, 0, LONGEST)
     return data[: at + len(key)] if at > 0 else b""

@@ -67,7 +67,7 @@ def as_png(payload: bytes) -> bytes:
 
 
 def json_prefix(name: str) -> bytes:
-    """Return the bytes before the JSON of a message of topic `name`; the closing brace after the JSON is not included."""
+    """Return the bytes of a publish operation before the JSON of its message, for the topic `name`."""
     return b'{"op":"publish","topic":"%b","msg":' % name.encode()
 
 

@@ -50,7 +50,7 @@ class Rosapi:
     def __init__(
         self, graph: Graph, limits: HubLimits, definitions: MessageDefinitions, wall_clock: Callable[[], int]
     ) -> None:
-        """Serve questions about `graph`; `wall_clock` returns nanoseconds since 1970."""
+        """Answer questions about `graph`; `wall_clock` returns nanoseconds since 1970."""
         self._graph = graph
         self._limits = limits
         self._definitions = definitions

@@ -89,7 +89,7 @@ def image(lines: int, index: int, count: int, *, replicas: int = 1) -> Image:
 
 
 def write(links: Sequence[SocketLink], words: int) -> None:
-    """Write a block to one board after the other, each acknowledged."""
+    """Write a block to one board after the other, and wait for each acknowledgement."""
     block = bytes(4 * words)
     for link in links:
         link.write_block(rm.INPUTS, block)

@@ -97,7 +97,7 @@ class Network:
         return {variable: inference.posterior(names[variable]).toarray() for variable in unknown}
 
     def evidences(self) -> dict[str, Known]:
-        """Return three sets of evidence: an empty one, the likeliest states of the first leaves, their least likely states.
+        """Return three sets of evidence: none; the likeliest states of the first leaves; their least likely states.
 
         The state of each leaf depends on the leaves before it, so that all states are possible together.
         """

@@ -22,7 +22,7 @@ Known: TypeAlias = Mapping[int, int]
 
 @dataclass(frozen=True, slots=True)
 class Sampled:
-    """Marginals by number of the unknown variable (none if only the speed counts), and the cost of the run.
+    """Marginals by index of the unknown variable (none if only the speed counts), and the cost of the run.
 
     Sweeps and cycles are summed over all chains; only a BM2 sets `effective`, `cycles` and `stop`.
     """

@@ -252,7 +252,7 @@ class _Echoes:
                     break
 
     async def add(self, number: int, numbers: list[float], *, most: int) -> bool:
-        """Add a published line, then act as `at_most`, but wait only for the first line, or if any line ever came back."""
+        """Add a published line, and act as `at_most`; wait only for the first line, or if any line ever came back."""
         first = not self._waiting and not self.lost
         self._waiting.append((number, numbers))
         return await self.at_most(most) if first or self._has_seen else not self._give_up(most)

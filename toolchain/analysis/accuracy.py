@@ -236,7 +236,7 @@ class _Reading(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class _Frames:
-    """The job of running the readings, one a piece: piece n runs reading n, which is one replica of frame n // `replicas`."""
+    """The job of running the readings: piece n runs the reading at index n, a replica of frame n // `replicas`."""
 
     boards: EmulatedBoards
     readings: Readings

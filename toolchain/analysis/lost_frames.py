@@ -97,7 +97,7 @@ def _share(chances: NDArray[np.float64], options: BuildOptions, cycles: int) -> 
 
 
 def _advice(plan: MachinePlan, drawn: Readings) -> str:
-    """Return advice: each option that alone saves enough frames; if none does, all options, or also fewer sensors."""
+    """Return advice: the options that save enough frames, each alone; else all together, or all with fewer sensors."""
     options, sensors = plan.options, len(plan.model.known)
     may_scale = options.sensor_mode is SensorMode.COLUMN and options.scaling is not Scale.ADDRESS
     rng: dict[str, Any] = {"rng": RngKind.LFSR32} if options.rng.lfsr_bits not in {None, 32} else {}
