@@ -46,7 +46,7 @@ class Goal:
     """A goal that this client has sent: `async for feedback in goal`, then `await goal.result(timeout)`.
 
     The iteration ends with the goal. If the connection is lost, iteration and result fail, because the server then
-    never reports the end of the goal. Leaving `async with` before the goal ends cancels it; then they fail too.
+    never reports the end of the goal. Leaving `async with` before the goal ends cancels the goal: both fail then, too.
 
     Attributes:
         action: Name of the action.

@@ -350,7 +350,7 @@ async def check_goal(stand: Server) -> None:
 
 
 async def check_wrong_type(stand: Server) -> None:
-    """Check that a subscriber with a wrong type, which gets no message, has an error with the server's reason."""
+    """Check that a subscriber with a wrong type gets an error that contains the server's reason."""
     topic = stand.topic()
     async with stand.clients() as (subscriber, publisher):
         await publisher.advertise(topic, ARRAY)

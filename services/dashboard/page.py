@@ -33,7 +33,7 @@ _IN_FLIGHT: Final = 2
 _HERE: Final = Path(__file__).parent
 _MAX_INBOUND: Final = 4096
 _MAX_ASKING: Final = 8
-"""Maximum number of ROS service calls for one browser, to set the simulated world's switches, that are unanswered."""
+"""Maximum number of unanswered ROS service calls with which one browser sets the simulated world's switches."""
 
 
 class Live(Element, component="live.js"):

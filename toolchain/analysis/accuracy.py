@@ -1,4 +1,4 @@
-"""Accuracy of a machine's posteriors compared with exact inference, split into quantisation loss and sampling loss.
+"""Accuracy of a machine's posteriors compared with exact inference; the quantisation loss is also reported separately.
 
 Each frame has three posteriors over the lines (the values of the searched variables): two by exact inference, from the
 model's probabilities and from the machine's codes, and one from the machine's counts. The first two differ by the

@@ -69,7 +69,7 @@ class Sampled:
         frames: All frames.
         without: Share of frames without a posterior.
         total_variation: Mean distance from exact inference, 1 for a frame without a posterior; None without a model.
-        alone: The same mean, but only over frames with a posterior; so are all fields below except `reasons`.
+        alone: The same mean over only the frames with a posterior; all fields below but `reasons` use only these, too.
         cycles: Cycles of the longest-running board.
         sweep_cycles: Mean cycles of a sweep; 0 if samples are taken after every move.
         effective_samples: Median and minimum of the effective samples of a frame; 0 if unknown.
