@@ -111,7 +111,7 @@ class BM1Kernel(ABC):
 
     @abstractmethod
     def _resume(self, going: list[int], run_until: int) -> None:
-        """Run the next slice of the replicas `going`; set their cycles and reasons."""
+        """Run the next slice of the replicas with the indices `going`; set their cycles and reasons."""
 
     def _check_resume(self, run_until: int, halted: Collection[int], halts: Collection[int]) -> None:
         replicas = len(self._reasons)

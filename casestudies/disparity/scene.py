@@ -87,7 +87,7 @@ class Scene:
         self._lattices = random.uniform(-1, 1, (len(_OCTAVES), 32, 32, 32))
 
     def pair(self, number: int, width: int, height: int) -> Pair:
-        """Render pair `number`, counted from 0: both images, with noise, and the truth about the left one."""
+        """Render pair `number`, counted from 0: both images, with noise, and the true disparities of the left one."""
         things = self._things(number)
         down, across = np.mgrid[:height, :width] + 0.5
         focal = FOCAL * width

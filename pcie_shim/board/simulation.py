@@ -116,7 +116,7 @@ class Simulation:
     def _execute(
         self, operation: str, first: int, second: int, clocks: int, limit: float = 0.0
     ) -> SimulatorAnswer:
-        """Send a request that takes about this number of clocks, and return its answer."""
+        """Send a request that takes about `clocks` clocks of the hardware, and return its answer."""
         # a busy computer must not look like a simulator that hangs
         limit = limit or ANSWER_S + (10 * clocks / self.speed if self.speed else 0)
         try:

@@ -1,4 +1,4 @@
-"""BM2 on published networks: distance of its marginals from exact inference, beside other Gibbs samplers.
+"""BM2 on published networks: distances of its and other Gibbs samplers' marginals from exact inference.
 
 pgmpy's wheel --> *.bif.gz --> our reader --> BM2, linear and coloured --> marginals --> total variation, per variable
                      └───────▶ pyagrum ─────▶ exact inference ───────────────────────────────────▲

@@ -9,7 +9,7 @@ from pathlib import Path
 from scripts.running.script import ROOT
 
 FLAKY_MOST = 2
-"""Maximum number of tests with processes that may fail once, and pass when they are run again alone."""
+"""Maximum number of tests with processes that may fail at first, if they pass when they are run again alone."""
 
 
 def pytest(*arguments: str) -> tuple[int, list[str]]:

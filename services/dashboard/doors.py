@@ -40,7 +40,7 @@ class Doors:
 
     Args:
         app: The application behind the doors.
-        policy: Tokens, and other web pages that may connect.
+        policy: The accepted tokens, and the other web pages that may connect.
         loopback: Whether the server listens on loopback, so that only this machine can reach it.
     """
 

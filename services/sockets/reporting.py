@@ -81,7 +81,7 @@ class ServiceManager:
         self._send("STOPPING=1")
 
     def _send(self, *assignments: str) -> bool:
-        """Send assignments; return whether they were accepted, because the manager's queue may be full."""
+        """Send assignments; return False if they were not accepted, for example because the manager's queue is full."""
         if self._address and assignments:
             with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
                 sender.setblocking(False)

@@ -65,7 +65,7 @@ _BOARD_REGISTERS: Final = 1032
 _REPLICA_BITS: Final = 5
 """Registers of bm1_control for each replica: its stop reason, whether it runs and whether it is halted."""
 _FEW_WORDS: Final = 8
-"""A memory of at most this many words is built from memory LABs, which, unlike a block, need output registers."""
+"""A memory of at most this many words is built from memory LABs; unlike memory blocks, they need output registers."""
 
 
 class Of(StrEnum):

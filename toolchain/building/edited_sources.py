@@ -134,7 +134,7 @@ def _with_parameters(
 
 
 def _with_memory(path: Path, memory: Memory, images: Sequence[Image]) -> tuple[list[Image], list[str]]:
-    """Return the images with the codes in a memory's file, and the edits of that file, as sentences."""
+    """Return the images with the codes of a memory's file, and a sentence for each image that this changes."""
     words = read_mif(path, (memory.width, memory.depth)).words
     if not memory.section:
         for address, (seed, due) in enumerate(zip(words, memory.words(), strict=True)):

@@ -202,7 +202,7 @@ _MOST_SEEDS: Final = 1 << 23
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoardLayout:
-    """The lines of each board, and the size of the register interface, which all boards share."""
+    """The lines of each board, and the size of the register interface, which is the same for all boards."""
 
     blocks: tuple[LineBlock, ...]
     """The block of lines of each board; none is larger than the first."""

@@ -38,7 +38,7 @@ async def receive(ros: Ros, heard: dict[int, tuple[int, ...]]) -> None:
 
 
 def differences(instance: Instance, addresses: tuple[int, ...]) -> str:
-    """Return the differences from the reference kernel's result; empty if there are none."""
+    """Return how a result differs from that of the reference kernel, as a clause; empty if it does not."""
     deployment = load_deployment(Path(os.environ["BM_DEPLOYMENT"]))
     report, posterior, machine = instance.report, instance.posterior, deployment.machine
     assert report is not None
