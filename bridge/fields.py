@@ -58,7 +58,7 @@ class Field:
             True if the message has the variable, and its unchanged value (None if it is missing or null).
 
         Raises:
-            FieldAmbiguousError: Several fields of the message have this bare name, and no earlier message had the variable.
+            FieldAmbiguousError: The message has several fields with this bare name, and no earlier message had any.
         """
         # A bare name is searched until it is found, and then has the same place in all messages.
         place = self.place

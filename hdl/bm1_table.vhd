@@ -16,7 +16,7 @@ entity bm1_table is
     WORD_BITS    : positive; -- width of the MIF's words
     DEPTH        : positive; -- number of words
     ADDRESS_BITS : positive; -- width of the address
-    FIRST_BIT    : natural;  -- lowest bit of a word that is read
+    FIRST_BIT    : natural;  -- lowest of the bits read from a word
     DATA_BITS    : positive  -- number of bits that are read
   );
   port (

@@ -209,7 +209,7 @@ NO_TOKEN: Final = bytes(8)
 
 
 class ProgramBegin(NamedTuple):
-    """A loader's announcement of a file of `size` bytes, with the token of the host's link to the board or `NO_TOKEN`."""
+    """A loader's announcement of a file of `size` bytes, with the token of its host's board link or `NO_TOKEN`."""
 
     size: int
     sha256: bytes

@@ -271,7 +271,7 @@ def _all_finite(value: Any) -> bool:
 
 
 def envelope_of(data: bytes) -> bytes:
-    """Return the bytes up to the first key `msg` of an operation: its envelope, probably. Without that key return none."""
+    """Return an operation up to its first key `msg`, which may be its envelope; empty bytes without that key."""
     key = _KEY if data[:1] < b"\x80" else _CBOR_KEY
     at = data.find(key, 0, LONGEST)
     return data[: at + len(key)] if at > 0 else b""

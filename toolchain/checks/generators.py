@@ -160,7 +160,7 @@ _MOST_PAIRS: Final = 20_000_000
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """Bits of one group that XOR to 0 in every cycle; a group is a bank or, with a generator per cell, a bank's line."""
+    """Bits of a group that XOR to 0 in every cycle; a group is a bank or, with a generator per cell, a bank's line."""
 
     group: int
     bits: tuple[Bit, ...]
