@@ -45,7 +45,7 @@ class Readiness:
         self._done = 0
 
     def record(self) -> None:
-        """Record that the process worked."""
+        """Record that the process has just done its work."""
         self._last = time.monotonic()
         self._done += 1
 
@@ -112,8 +112,8 @@ async def report_refused(
 class LossyPublication:
     """A publication that drops messages while the server is disconnected or slow.
 
-    A message that is too large for the server is dropped, too. The user is warned once of slowness, and once of size,
-    until messages are published again.
+    A message that is too large for the server is dropped, too. The user is warned of slowness and of size,
+    each once until messages are published again.
     """
 
     def __init__(self, publication: Publication) -> None:

@@ -32,7 +32,7 @@ FACTOR_BITS_MAX: Final = 20
 """Maximum number of bits of a factor's variables together; a factor of 20 bits has 20 * 2**19 codes, or 20 MB."""
 
 RESULT_WORDS_MAX: Final = 4096
-"""Maximum number of words of all histograms, with that of the joint: the size of RESULTS in the register map."""
+"""Maximum number of words of all histograms, including the joint one: the size of RESULTS in the register map."""
 
 CHAINS_MAX: Final = 65536
 """Maximum number of boards that run chains of one model."""

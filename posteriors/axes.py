@@ -20,7 +20,7 @@ class Axis:
 
     @property
     def unit(self) -> str:
-        """The unit of its values; empty without one."""
+        """The unit of the axis's values; empty if they have none."""
         return "" if self.dimension is None else self.dimension.unit
 
     @property

@@ -2,7 +2,7 @@
 
 It is needed only for development: its output is committed, so SystemRDL tools are not needed at run time. The hash
 of the map covers the definition (names, addresses, sizes, fields, access, resets, encodings), but not the
-explanations. PeakRDL writes the C header. The other files are the templates in register_templates/, because:
+explanations. PeakRDL writes the C header. The other files come from templates in register_templates/, because:
 
 - peakrdl-markdown repeats every element of an array, leaves out the values of encodings, and has no links.
 - peakrdl-regblock-vhdl buffers the low word of a 64-bit register until the high one is written, but a board accepts
@@ -161,7 +161,7 @@ def literal(value: int) -> str:
 
 
 def ones(mask: int) -> list[int]:
-    """Return the numbers of the bits that are 1."""
+    """Return the positions of the bits that are 1."""
     return [bit for bit in range(32) if mask >> bit & 1]
 
 

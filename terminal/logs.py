@@ -47,7 +47,7 @@ class LogFormat(StrEnum):
 
 
 def log_format() -> LogFormat:
-    """Return the current format; text if the environment variable is invalid (the settings report the error)."""
+    """Return the current log format; text if the environment variable is invalid (the settings report the error)."""
     value = os.environ.get(FORMAT_VARIABLE, "")
     return LogFormat(value) if value in set(LogFormat) else LogFormat.TEXT
 

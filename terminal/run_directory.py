@@ -61,7 +61,7 @@ def run_directory(given: Path | None) -> Path:
 
 
 def status_directory(given: Path | None, name: str) -> Path | None:
-    """Return the run directory of a process without a master; if there is none, warn and return None."""
+    """Return the run directory of a process without a master; if it is unusable, warn and return None."""
     try:
         return run_directory(given)
     except OutputError as error:

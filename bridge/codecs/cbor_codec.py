@@ -192,7 +192,7 @@ def typed_array(numbers: Sequence[Any], elements: str) -> cbor2.CBORTag:
 
 
 def with_arrays(value: Any) -> Any:
-    """Replace every list of numbers in a message that arrived as JSON, in place.
+    """Replace every list of numbers by an array, in place, in a message that arrived as JSON.
 
     Floats become float64, with NaN for null; integers become int64, or uint64 if int64 is too small; bytes
     become uint8. All other lists, including numbers mixed with booleans, remain lists.

@@ -36,7 +36,7 @@ class Pair:
     disparity: Array
     """float64[height, width]: true disparity in pixels, that is, how much further left the right camera sees the point."""
     occluded: NDArray[np.bool_]
-    """bool[height, width]: pixels whose point the right camera does not see: something is in front of it, or it is outside the image."""
+    """bool[height, width]: pixels whose point is hidden from the right camera, or outside its image."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

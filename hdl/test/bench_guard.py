@@ -111,7 +111,7 @@ async def values_at_their_limits(dut: Any) -> None:
 
 @cocotb.test()
 async def every_address(dut: Any) -> None:
-    """Read and write every word of the map, and bytes between words, while idle and while running."""
+    """Read and write every word of the map, and bytes between words, while the machine is idle and while it runs."""
     implemented = {"INPUTS": 9, "PRIOR_SELECTS": REPLICAS, "OUTCOMES": 4 * REPLICAS, "RESULTS": 12}
     kind: dict[int, bool] = {}
     for name, block in rm.BLOCKS.items():

@@ -178,7 +178,7 @@ class RtlBoard:
             raise RefusedError(ErrorCode.TOO_LONG, f"{count} words from {address:#06x} on exceed the map")
 
     def _refuse(self, address: int, *, is_first: bool) -> NoReturn:
-        """Refuse an access whose word at `address` the hardware refused, with the error that the hardware reports."""
+        """Raise a RefusedError with the code that the hardware reports for the word at `address`."""
         status = self._word(rm.STATUS)
         code = ErrorCode(field_of(rm.STATUS_ERROR_MASK, status))
         if code is ErrorCode.OUTSIDE and not is_first:

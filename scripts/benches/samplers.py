@@ -68,7 +68,7 @@ def thrml_gibbs(
     sweeps: int,
     burn_in: int,
 ) -> Sampled:
-    """Run THRML's block Gibbs sampler: 64 chains with sweeps/64 sweeps each, from one state; compilation is not timed.
+    """Run THRML's block Gibbs sampler: 64 chains of sweeps/64 sweeps, all from `start`; compilation is not timed.
 
     Args:
         factors: The network.

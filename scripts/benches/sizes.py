@@ -29,7 +29,7 @@ from toolchain.building.options import BuildOptions
 from toolchain.models import Known, Model, dimension
 
 LINES, SENSORS, PADDING = (64, 256, 1024, 4096), (2, 6, 14, 30), (0, 1_000, 10_000, 100_000, 400_000)
-"""The sizes to measure; PADDING is the number of bytes of a message that are not readings."""
+"""The sizes to measure; PADDING is the number of bytes added to each message."""
 BASE = 1024, 6, 0
 """The base problem: lines, sensors and padding, of which each series of measurements varies one."""
 NEARLY_EVEN = 0.45, 0.55

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Engine(StrEnum):
-    """The machine behind the registers of a board."""
+    """The implementation of the machine behind a board's registers."""
 
     EMULATED = "emulated"
     RTL = "rtl"

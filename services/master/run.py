@@ -40,7 +40,7 @@ _DRAWN_EVERY = 0.2
 _REASON_TIME = 5.0
 """Seconds beyond `seen_timeout` for the publisher to ask the server why no result was seen."""
 _GRACE_PERIOD = 2.0
-"""Seconds by which the master's report that no reading came is delayed; the subscriber's own says more."""
+"""Delay in seconds of the master's report that no reading came, because the subscriber's own report says more."""
 
 
 class Master:

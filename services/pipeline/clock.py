@@ -12,7 +12,7 @@ _CLOCK_TYPE: Final = "rosgraph_msgs/Clock"
 _INTERVAL_MS: Final = 10
 """Minimum time in ms between two messages from the server, because simulators publish a thousand a second."""
 _MOST_NS: Final = 3600 * 10**9
-"""Maximum advance of the ticks by one message, so that jumps of the time never make them exceed 64 bits."""
+"""Maximum advance of the ticks by one message, so that a jump of the time never makes the ticks exceed 64 bits."""
 
 
 class Clock:

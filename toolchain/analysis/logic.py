@@ -63,7 +63,7 @@ WORD_BITS: Final = 32
 _BOARD_REGISTERS: Final = 1032
 """Registers of bm1_axi, bm_register_block, bm1_registers and bm1_control, except those for target and replicas."""
 _REPLICA_BITS: Final = 5
-"""Registers of bm1_control for each replica: its stop reason, whether it runs and whether it is halted."""
+"""Number of flip-flops of bm1_control for each replica: its stop reason, whether it runs and whether it is halted."""
 _FEW_WORDS: Final = 8
 """A memory of at most this many words is built from memory LABs; unlike memory blocks, they need output registers."""
 

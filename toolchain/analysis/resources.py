@@ -35,7 +35,7 @@ class Estimate:
 
     @property
     def alms(self) -> float:
-        """All ALMs: those of memory LABs, and the larger number of what look-up tables and registers need."""
+        """All ALMs: those of memory LABs, and those for look-up tables or for registers, whichever are more."""
         logic = max(self.logic.alms, self.logic.registers / self.device.registers_per_alm)
         return logic + self.memories.alms
 

@@ -234,7 +234,7 @@ class BM2Options:
 
 
 def given_flags(options: CommonOptions, group: type[BM1Options | BM2Options]) -> list[str]:
-    """Return the flags of a group that a user must have given: neither at their default nor set by `--thesis`."""
+    """Return the flags of a group whose values came from the user: neither defaults nor set by `--thesis`."""
     preset = THESIS if options.thesis else {}
     return [
         _flag(each.name)

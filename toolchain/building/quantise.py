@@ -147,7 +147,7 @@ def _quantised_prior(model: Model, prob_bits: int, scale: Scale) -> tuple[NDArra
 
 
 def scaled(table: NDArray[np.float64], scale: Scale) -> NDArray[np.float64]:
-    """Return a table, float64[values, lines], with each row or the whole divided by its maximum; zeros stay."""
+    """Return a table, float64[values, lines], with each row, or the whole table, divided by its maximum; zeros stay."""
     if scale is Scale.NONE:
         return table
     largest = table.max(axis=1, keepdims=True) if scale is Scale.ADDRESS else np.asarray(table.max())

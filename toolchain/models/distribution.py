@@ -73,7 +73,7 @@ class IntegerType:
 class IntervalType:
     """The real numbers from `low` to `high`, divided into equal intervals, each represented by its centre.
 
-    With `wraps` they are on a circle: `high` equals `low`, as for a bearing from 0 to 360.
+    With `wraps` they are on a circle: `high` is the same point as `low`, as for a bearing from 0 to 360.
     """
 
     low: float

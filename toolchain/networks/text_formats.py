@@ -1,4 +1,4 @@
-"""Readers of network files in plain text: BIF, Hugin's NET and UAI, over one scanner of words, signs and numbers."""
+"""Readers of network files in plain text: BIF, UAI, and Hugin's NET, over one scanner of words, signs and numbers."""
 
 import math
 import re

@@ -220,13 +220,13 @@ def _memory_files(images: Sequence[Image]) -> str:
 _TOKEN: Final = re.compile(r'\n|--[^\n]*|\w*"[^"\n]*"|[\w.]+|:=|=>|[^\s]')
 _MOST_BYTES: Final = 4 << 20
 _FLAGS: Final = {"RNG_KIND": " --rng", "RNG_SHARED": " --per-cell", "RNG_BANKS": " --rng-banks"}
-"""For each constant of the generators, the build's flag that changes it; an error about a wrong package names it."""
+"""For each constant of the generators, the build's flag that changes it; an error about a wrong constant names it."""
 _IMAGE_HASH: Final = re.compile(r'(image_hash\s*=>\s*)x"[0-9a-f]{64}"')
 
 
 @dataclass(frozen=True, slots=True)
 class PackageTokens:
-    """The tokens of the package, each with its line; in lower case, as VHDL ignores case, and without comments.
+    """The tokens of the build's VHDL package, in lower case, without comments, each with its line.
 
     Hashes of images are left out, because they follow from the other tokens.
     """

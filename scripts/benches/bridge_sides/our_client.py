@@ -36,7 +36,7 @@ async def publish(ros: Ros, topic: str, values: int, count: int) -> dict[str, An
 
 
 async def receive(ros: Ros, topic: str, count: int, compression: Any) -> dict[str, Any]:
-    """Receive `count` messages, and acknowledge some."""
+    """Receive `count` messages, and acknowledge every `ACK_EVERY`-th one."""
     acks = await ros.advertise(topic + "/heard", TYPE)
     arrays: Any = "numpy" if compression == "cbor" else "list"
     listener = ros.subscribe(

@@ -31,7 +31,7 @@ def publish(ros: roslibpy.Ros, topic: str, values: int, count: int) -> dict[str,
 
 
 def receive(ros: roslibpy.Ros, topic: str, count: int, compression: str) -> dict[str, Any]:
-    """Receive `count` messages, and acknowledge some."""
+    """Receive `count` messages, and acknowledge every `ACK_EVERY`-th one."""
     heard, acks = threading.Event(), roslibpy.Topic(ros, topic + "/heard", TYPE)
     seen = [0, 0.0]
 
