@@ -164,7 +164,7 @@ def demo(
         Path, typer.Option(help="Folder for the pictures, the deployment and logs.", metavar="DIR")
     ] = Path("out"),
 ) -> int:
-    """Run a case study from end to end, without a robot: the boat."""
+    """Run a case study from end to end, without a robot: the boat, or the one that a flag selects."""
     if dashboard and find_spec("nicegui") is None:
         raise OutputError(
             "--dashboard needs NiceGUI, which is not installed: pip install 'rosbayes[dashboard]', or leave it out"

@@ -41,7 +41,7 @@ SAMPLES_MAX: Final = 2**32 - 1
 """Maximum number of samples of a frame, so that no 32-bit count in a histogram overflows."""
 
 CDES_MAX: Final = 8192
-"""Maximum number of factors."""
+"""Maximum number of factors, each of which has a CDE."""
 
 FACTOR_VARIABLES_MAX: Final = 32
 """Maximum number of variables of a factor: its array has an axis for each."""

@@ -197,7 +197,7 @@ class BoardMachine(ABC):
 
     @property
     def cycles(self) -> int:
-        """Cycles of this frame."""
+        """Number of cycles of this frame so far."""
         return int(self._kernel.cycles)
 
 

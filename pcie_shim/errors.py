@@ -14,7 +14,7 @@ class EndpointError(PcieShimError):
 
 
 class CredentialsError(PcieShimError):
-    """A file with a key that cannot be used."""
+    """A key file cannot be used."""
 
     exit_code = 2
 

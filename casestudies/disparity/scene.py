@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 Array: TypeAlias = NDArray[np.float64]
 
 BASELINE: Final = 0.1
-"""Distance of the cameras in metres."""
+"""Distance between the cameras in metres."""
 FOCAL: Final = 1.0
 """Focal length of the cameras, in widths of an image."""
 NOISE: Final = 1.5

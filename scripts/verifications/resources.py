@@ -140,7 +140,7 @@ def _is_near(errors: tuple[float, float, int]) -> bool:
 
 
 def _fit(machines: Sequence[BM1Parameters], netlists: Sequence[Netlist]) -> None:
-    """Print the costs that minimise the squares of relative errors, next to the current ones."""
+    """Print the costs that minimise the sum of squared relative errors, next to the current costs."""
     parts = [logic_of(each).parts for each in machines]
     counts = np.array([[sum(part.counts.get(of, 0) for part in each) for of in Of] for each in parts], float)
     aluts = _costs(counts / np.array([[each.aluts] for each in netlists]))

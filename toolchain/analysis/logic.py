@@ -135,7 +135,7 @@ class LogicPart:
 
     @property
     def alms(self) -> float:
-        """ALMs that hold the look-up tables."""
+        """Number of ALMs that hold the look-up tables."""
         return sum(count * COSTS[of].alms for of, count in self.counts.items())
 
 
@@ -147,17 +147,17 @@ class Logic:
 
     @property
     def aluts(self) -> float:
-        """Look-up tables, including carry chains."""
+        """Number of look-up tables, including carry chains."""
         return sum(part.aluts for part in self.parts)
 
     @property
     def alms(self) -> float:
-        """ALMs that hold the look-up tables."""
+        """Number of ALMs that hold the look-up tables."""
         return sum(part.alms for part in self.parts)
 
     @property
     def registers(self) -> int:
-        """Flip-flops."""
+        """Number of flip-flops."""
         return sum(part.registers for part in self.parts)
 
 

@@ -41,7 +41,7 @@ class Estimate:
 
     @property
     def alm_share(self) -> float:
-        """Share of the device's ALMs."""
+        """Share of the device's ALMs that the machine takes."""
         return self.alms / self.device.alms
 
     @property

@@ -176,7 +176,7 @@ class Deployment(DeploymentFile):
         return (Dimension(label=REPLICA, size=replicas), *self.searched)
 
     def reading_shape(self, variable: Variable) -> tuple[int, ...]:
-        """Shape of a variable's reading: () a number, (lines,), (replicas,), or (replicas, lines)."""
+        """Shape of a variable's reading: () for one number, (lines,), (replicas,), or (replicas, lines)."""
         machine = self.machine
         per_line = machine.reads_lines and variable.kind == "sensor"
         replicas = () if machine.replicas == 1 else (machine.replicas,)

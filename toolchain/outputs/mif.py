@@ -44,7 +44,7 @@ class Mif:
     """The contents of a memory."""
 
     width: int
-    """Bits of a word."""
+    """Number of bits of a word."""
     words: tuple[int, ...]
     """All words, from address 0; omitted addresses are 0, as in Quartus."""
 
