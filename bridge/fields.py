@@ -163,7 +163,7 @@ def format_place(place: Place) -> str:
 
 
 def find_places(message: dict[str, Any], name: str) -> list[Place]:
-    """Return all places of a bare name, depth first in the order of the message, except inside arrays."""
+    """Return the places of all fields with a name, depth first in the order of the message, except inside arrays."""
     # A stack instead of recursion, because messages may be deeply nested; reversed, so that places are in the order of
     # the message.
     places: list[Place] = []

@@ -34,7 +34,7 @@ Seed = Annotated[
 FirstTimeout = Annotated[float, typer.Option(min=0.1, help="Seconds until the first result.")]
 Timeout = Annotated[float, typer.Option(min=0.1, help="Seconds between two results.")]
 KEPT: Final = 2000
-"""Number of frames that a viewer keeps for pictures and numbers if it runs until Ctrl-C."""
+"""Number of frames that a viewer keeps for its pictures and statistics if it runs until Ctrl-C."""
 Count = Annotated[
     int | None,
     typer.Option(

@@ -39,7 +39,7 @@ class Grid:
     def mean(self, posterior: Sequence[float]) -> tuple[float, float]:
         """Return the mean position (x, y) of a posterior over the cells' centres, in the map's units.
 
-        The posterior is float64[cells], row-major, of numbers from 0, at least one above 0; it need not sum to 1.
+        The posterior is float64[cells], row-major, without negative values; its sum is above 0, but need not be 1.
         """
         total = math.fsum(posterior)
         by_row = [

@@ -284,7 +284,7 @@ class _Course(FrameCourse):
     ) -> tuple[Sequence[int], Blocks]:
         """Return the boards that run on, and the mask of halted replicas.
 
-        With `slices`, a replica that has overflowed on one board ends on all; with `own`, there is one slice.
+        If the frame's `stop` is `slices`, a replica that has overflowed on one board is halted on all boards.
         """
         over = {
             replica

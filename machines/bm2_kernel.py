@@ -109,7 +109,7 @@ class BM2Kernel(ABC):
         return self._continue(pause_at)
 
     def step(self, pause_at: int = 0) -> BM2StopReason:
-        """Continue after a pause; if the frame is not paused, or `pause_at` is not later, raise a StartError."""
+        """Continue after a pause; raise a StartError if the frame is not paused or `pause_at` is not after `cycles`."""
         if self.reason is not BM2StopReason.PAUSED:
             raise StartError(
                 f"The machine is not paused: it has stopped with reason {self.reason.name.lower()}."

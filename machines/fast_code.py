@@ -42,7 +42,7 @@ class Generators(NamedTuple):
 
 
 class _Store(NamedTuple):
-    """Cached words, by slot (a block of cycles in a bank; the last is for scratch) and by row (a code of a column)."""
+    """Cached words, by slot (a block of cycles of a bank; the last slot is scratch) and by row (a code of a column)."""
 
     words: Words  # [slots, rows * BLOCK_WORDS]
     filled: npt.NDArray[np.uint8]  # [slots, rows]: whether these words are cached
@@ -304,7 +304,7 @@ def _mask(first: int, end: int, mask: Words) -> None:
 def _cycle_of(
     words: Words, places: npt.NDArray[np.uint32], width: int, mask: Words, line: int, nth: int
 ) -> int:
-    """Return the cycle of a block in which a line's masked bit is 1 for the `nth` time, from 1; it must exist."""
+    """Return the cycle of a block in which a line's masked bit is 1 for the `nth` time; there must be `nth` ones."""
     word = 0
     while True:
         made = mask[word]

@@ -244,7 +244,7 @@ class ForkedChild(Child):
     """A child that is forked from this process, whose loaded modules it shares, and runs a function."""
 
     def __init__(self, name: str, run: Callable[[], int], *, ends: deque[float]) -> None:
-        """Store the function, whose result is the exit code."""
+        """Store the function, whose result is the child's exit code; `ends` as in `Child`."""
         super().__init__(name, [name], ends=ends)
         self._run = run
 

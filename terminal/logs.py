@@ -180,7 +180,7 @@ def log_libraries(level: int, form: str) -> None:
 
 
 def escape_last_resort() -> None:
-    """Escape libraries' warnings while logging is not configured, because some quote text from a server."""
+    """Escape control characters in warnings of libraries, which may quote a server, while logging is not configured."""
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(_OneLine())
 

@@ -180,7 +180,7 @@ class Simulator(StrEnum):
     GHDL = "ghdl"
     """GHDL: interprets the VHDL; compiled within seconds."""
     VERILATOR = "verilator"
-    """Verilator, after a translation to Verilog by GHDL: a hundred times as fast, compiled within minutes."""
+    """Verilator, after a translation to Verilog by GHDL: a hundred times as fast as GHDL, compiled within minutes."""
 
     @property
     def tools(self) -> tuple[str, ...]:

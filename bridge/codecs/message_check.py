@@ -1,6 +1,6 @@
 """Checks of outbound messages against the definition of their type: names of fields, and shapes of arrays.
 
-They find mistakes in a program (a misspelt field, nested arrays), which its first message already shows. The values
+They find mistakes of a program that its first message already shows: a misspelt field, nested arrays. The values
 of scalars are not checked.
 """
 
@@ -12,7 +12,7 @@ from bridge.errors import MessageTypeError, NameFormError
 from bridge.names import ros1_type, ros2_type
 
 SCALAR: Final = -1
-"""Stands for the length of a field that is not an array; 0 stands for an array of any length."""
+"""The `length` of a `FieldType` that is not an array; an array of any length has 0."""
 _MAX_TYPES: Final = 1000
 _MAX_FIELDS: Final = 1000
 _MAX_LENGTH: Final = (1 << 32) - 1

@@ -31,7 +31,7 @@ def is_text(payload: bytes) -> bool:
 
 @dataclass(eq=False, slots=True)
 class _Entry:
-    """One message in the queue; a `payload` of None is a gap."""
+    """One message in the queue, or the gap that a dropped message leaves (a `payload` of None)."""
 
     payload: bytes | None
     lane: "Lane | None"

@@ -117,7 +117,7 @@ class Topics:
         """Perform `publish` operations whose envelopes (the bytes before the message) are known, parsing only the rest.
 
         `messages` may contain any operations. Returns the index, from `first` on, of the first one that was not
-        performed, because it must be parsed in full or the turn was over; `len(messages)` if there is none.
+        performed, because it must be parsed in full or the client's turn was over; `len(messages)` if there is none.
         """
         advertisement = client.last_published
         while advertisement is not None and first < len(messages) and self._dispatcher.work <= TURN_WORK:
@@ -382,7 +382,7 @@ class Topics:
 
 
 def _learn_envelope(advertisement: Advertisement, name: str, raw: bytes) -> None:
-    """Store the bytes before the message of an operation, if they identify the topic's next operations."""
+    """Store the envelope of a `publish` operation, by which the topic's next ones are known, if it has a usable one."""
     client, envelope = advertisement.client, envelope_of(raw)
     if envelope and topic_of(envelope) == name:
         _forget_envelope(advertisement)

@@ -26,7 +26,7 @@ POSITIONS_PICTURE: Final = "figure-4.4.png"
 SHARES_PICTURE: Final = "figure-4.5.png"
 PROJECTED_PICTURE: Final = "figure-4.5-projected.png"
 CLOCK_HZ: Final = 100e6
-"""Clock, as in `toolchain inspect`, in the figure projected to real boards; the thesis does not state one."""
+"""Assumed clock of real boards, as in `toolchain inspect`, because the thesis does not state one."""
 Clock: TypeAlias = Annotated[
     float,
     typer.Option(

@@ -48,7 +48,7 @@ class Matched:
     total_s: float
     """Time from the pair to the last posterior."""
     boards_s: float
-    """Time of the boards' cycles at the clock of real boards, without their links."""
+    """Time of the boards' cycles at the clock of real boards, without transfers over the links."""
     cycles: int
 
     @property

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 FILTERS: Final = ("gradient_x", "gradient_y", "surround")
 """The sensors of the machine, one for each filter.
 
-The derivatives across and down, and the difference between a small and a large surround (a Laplacian). None of the
-filters responds to a difference in brightness between the cameras, and their noise is nearly independent, as naive
+They are the derivatives across and down, and the difference between a small and a large surround (a Laplacian). None of
+the filters responds to a difference in brightness between the cameras, and their noise is nearly independent, as naive
 fusion assumes.
 """
 SCALES: Final = (2.0, 2.0, 4.0)

@@ -152,7 +152,7 @@ class BoardServer:
     def __init__(
         self, endpoint: Endpoint, index: int, stop: StopSignal, board: Board, link: LinkModel | None = None
     ) -> None:
-        """Listen at both ports, or raise an EndpointError."""
+        """Listen at the endpoint and at its programming port, or raise an EndpointError."""
         self.board = board
         self._link = link
         self._index = index

@@ -37,7 +37,7 @@ IN_FLIGHT = 32
 WINDOW = {SMALL: 400, LARGE: 100}
 """Maximum number of messages by which a receiving client lags, by number of values: so few that the hub drops none."""
 COUNTS = {SMALL: (12_000, 12_000, 600), LARGE: (1_000, 2_000, 200)}
-"""Messages to publish, to receive and to echo in one turn, by number of values; each takes 50 ms or more in all."""
+"""Number of messages to publish, to receive and to echo in one turn, by number of values: each count takes 50 ms."""
 SERVER_MESSAGES = {"hub": 100_000, "Tornado double": 8_000}
 SERVER_TURNS = 5
 # Bytes of a published message that are searched for the mark of the last one.

@@ -303,7 +303,7 @@ def measure(arguments: argparse.Namespace, folder: Path) -> float:
 
 @contextmanager
 def counted_batches() -> Iterator[list[int]]:
-    """Yield a list that grows with each batch that is submitted."""
+    """Yield a list to which each batch submitted to the scheduler adds an element."""
     from distributed import Client
 
     submit, found = Client.submit, list[int]()

@@ -78,7 +78,7 @@ async def publish(ros: Ros, sent: dict[int, float]) -> None:
 
 
 async def display(stand: Stand, chromium: Browser, arguments: argparse.Namespace) -> Rows:
-    """Measure with one window and with two, then the memory of the dashboard's process and of the browser."""
+    """Measure display and CPU time with one window and with two, then the memory of dashboard and browser."""
     sent: dict[int, float] = {}
     async with connect(stand.uri, check_types=False) as ros:
         publishing = asyncio.create_task(publish(ros, sent))

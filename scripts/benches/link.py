@@ -74,7 +74,10 @@ class Fitted(NamedTuple):
 
 
 def image(lines: int, index: int, count: int, *, replicas: int = 1) -> Image:
-    """Return an image whose machine counts to 1 in a few cycles; with replicas, its board has all words of INPUTS."""
+    """Return an image whose machine reaches a count of 1 in a few cycles.
+
+    With several replicas, the block INPUTS has as many words as the register map allows.
+    """
     parameters = BM1Parameters(lines=lines, sensor_bits=(1,), replicas=replicas)
     codes = np.full((2, lines), parameters.ones_code, np.uint16)
     return Image(

@@ -33,7 +33,7 @@ LINES, SENSORS, PADDING = (64, 256, 1024, 4096), (2, 6, 14, 30), (0, 1_000, 10_0
 BASE = 1024, 6, 0
 """The base problem: lines, sensors and padding, of which each series of measurements varies one."""
 NEARLY_EVEN = 0.45, 0.55
-"""Probabilities of a sensor's reading 1, given a line."""
+"""Bounds between which the probability of a reading of 1 is drawn, for each sensor and line."""
 TYPE = "bench_msgs/Readings"
 PARTS = {
     "rosbridge": ("wire_in", "rosbridge_in", "rosbridge_out", "wire_out"),

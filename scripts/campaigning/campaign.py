@@ -25,7 +25,7 @@ STEPS, CALM = 10, 200
 SHORT_CALM = 150
 LIMIT = 24 * 3600.0
 MOST_KIB, MOST_DESCRIPTORS = 32 * 1024, 8
-"""Maximum growth of a process's memory and number of descriptors in the second half of a round, with full caches."""
+"""Maximum growth of a process in the second half of a round, when its caches are full: of memory, and of open files."""
 
 
 async def run(options: argparse.Namespace, folder: Path) -> int:

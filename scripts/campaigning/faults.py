@@ -72,7 +72,7 @@ SHORT: tuple[Step, ...] = (
 ENDS = {"master": 1, "hub": 2, "boards": 3}
 """How often faults may end a role in a round: boards 3 times, as a board's 4th failure in a minute ends the master."""
 MOST_ENDS = 2
-"""The same maximum for each role that is not in `ENDS`, and for the roles' connections to the master."""
+"""Maximum ends per round of each role that is not in `ENDS`, and of each role's connection to the master."""
 _ENDS_LINK = {"kill", "corrupt", "repeat", "cut", "finish", "cut-inside", "memory"}
 _FAILS_BOARD = {*_ENDS_LINK, "stop", "hold"}
 _CUTS_ROSBRIDGE = {"gone", "finish", "nonsense", "cut-inside", "files"}

@@ -20,7 +20,7 @@ _KINDS: dict[Any, str] = {int: "NUMBER", positive: "NUMBER", float: "NUMBER", Pa
 
 
 class ScriptParser(argparse.ArgumentParser):
-    """A parser that adds kinds of values and defaults to the help; the description is the first line of a docstring."""
+    """A parser whose help shows the kind and default of each value; it takes the first line of `description`."""
 
     def __init__(self, prog: str, description: str) -> None:
         super().__init__(prog, description=description.splitlines()[0])

@@ -145,7 +145,7 @@ class Stand:
         return f"there is one from {' and '.join(names)}" if names else None
 
     async def end(self, *names: str) -> None:
-        """End processes, all by default."""
+        """End the processes with these names, or all if there are no names."""
         await asyncio.gather(*(self._processes[name].end() for name in names or self._processes))
 
 

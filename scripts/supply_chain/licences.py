@@ -13,7 +13,7 @@ RULES = tomllib.loads(Path(__file__).with_name("licences.toml").read_text(encodi
 
 
 def licence_of(component: dict[str, Any]) -> str:
-    """Return a component's licence, from licences.toml if a person has read it in the package, otherwise from its metadata."""
+    """Return a component's licence: from licences.toml if a person has looked it up, otherwise from its metadata."""
     stated = [
         each.get("expression")
         or each["license"].get("id")
@@ -24,7 +24,7 @@ def licence_of(component: dict[str, Any]) -> str:
 
 
 def is_allowed(licence: str) -> bool:
-    """Return whether an SPDX expression permits a choice of allowed licences."""
+    """Return whether an SPDX expression can be fulfilled with allowed licences alone."""
     if SPDX.validate(licence).errors:
         return False
     parsed = SPDX.parse(licence)

@@ -112,7 +112,7 @@ class Server(Stand):
 
     @contextlib.asynccontextmanager
     async def clients(self) -> AsyncIterator[tuple[Ros, Ros]]:
-        """Return a subscriber and a publisher."""
+        """Connect two clients, a subscriber and a publisher."""
         async with connect(self.uri) as subscriber, connect(self.uri) as publisher:
             yield subscriber, publisher
 

@@ -32,7 +32,7 @@ _ENDING_TIME: Final = 5.0
 _STOPPING_S: Final = 2.0
 """Seconds after which a board that does not end is killed."""
 _LISTENS: Final = 128
-"""A board's process writes the board's number to its parent as a sign of life, or plus this when the board listens."""
+"""Added to the number that a board's process writes to its parent as a sign of life, once, when the board listens."""
 
 
 def blank_board(index: int, settings: Settings, hardware: SimulatedHardware | None) -> Board:

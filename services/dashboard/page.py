@@ -29,7 +29,7 @@ _STATS_EVERY: Final = 0.5
 _OF_ROBOT: Final = ["state", "connected", "why", "boards", "landmarks", "switches", "can_set_pose", "samples"]
 """Attributes of the robot that are sent to the page unchanged."""
 _IN_FLIGHT: Final = 2
-"""Maximum number of unacknowledged messages to a browser; with more, it would only show older frames."""
+"""Maximum number of unacknowledged messages to a browser; with more, the page would only show older frames."""
 _HERE: Final = Path(__file__).parent
 _MAX_INBOUND: Final = 4096
 _MAX_ASKING: Final = 8

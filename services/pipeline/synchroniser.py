@@ -62,7 +62,7 @@ class _Topic(Generic[Item]):
         return near if near is not None and abs(near.stamp - stamp) <= reach else None
 
     def may_complete(self, stamp: int, reach: int) -> bool:
-        """Return whether the next message may be within `reach` of a stamp, according to the period."""
+        """Return whether the next message may be within `reach` of a stamp, by the shortest interval so far."""
         if self.newest is None:
             return True
         # the shortest interval: lost messages make the others longer

@@ -161,7 +161,7 @@ def _options(deployment: Deployment, image: Image) -> BuildOptions:
 def _plan(
     source: Model | Question, options: BuildOptions, deployment: Deployment, image: Image
 ) -> MachinePlan | BM2Plan:
-    """Return the plan for the machine of a deployment, or raise a BuildError if the model now needs another one."""
+    """Return the plan for the machine of a deployment, or raise a BuildError if the model now needs another machine."""
     model, why = model_for(source, options)
     sizes = [(each.label, each.size) for each in model.searched]
     built_sizes = [(each.label, each.size) for each in deployment.searched]

@@ -31,7 +31,7 @@ _LARGE_ERROR: Final = 0.01
 _STATE_BITS: Final = 20
 """Maximum number of bits of a state for the check whether all states are connected."""
 _PATTERN_BITS: Final = 24
-"""Maximum number of state bits and optional known variables together, up to which connections of states are checked."""
+"""Maximum sum of state bits and optional known variables at which it is checked that all states are connected."""
 _BLANKET_BITS: Final = 16
 """Maximum number of bits that share a factor with one bit; all their values are tried in `Check.OPPOSITE_CLIPS`."""
 _RELATED_BITS: Final = 2048

@@ -90,7 +90,7 @@ class CheckedMachine:
         deployment: Its deployment, with variables, lines and limits.
         board: The machine of the first board: parameters and random numbers are the same on all boards.
         prior: uint16[rows, lines], the prior's codes with the lines of all boards.
-        tables: One uint16[2**bits, lines] per column, likewise.
+        tables: One uint16[2**bits, lines] per column, with the lines of all boards.
         model: The model with the probabilities, or None if only the codes are known.
     """
 

@@ -23,7 +23,7 @@ from toolchain.errors import DamagedDeploymentError, DeploymentError, ModelError
 
 _SUM_TOLERANCE: Final = 1e-6
 _MOST_WORK: Final = 2**27
-"""Maximum number of multiplications in one prediction; so many take about 0.2 s."""
+"""Maximum number of multiplications in one prediction; that many take about 0.2 s."""
 _HEADER_BYTES: Final = 4096
 
 

@@ -134,7 +134,7 @@ class LabelType:
 
     @property
     def offset(self) -> float:
-        """The number of the first name."""
+        """The number that stands for the first name."""
         return self._numbers()[0]
 
     @property

@@ -109,7 +109,7 @@ class Scanner:
         return int(word)
 
     def numbers(self, end: str, wanted: int, what: str, *, between: str = ",") -> NDArray[np.float64]:
-        """Consume numbers and the sign `end` after them, ignoring the signs `between`: float64[wanted]."""
+        """Consume float64[wanted], between which the signs `between` are ignored, and the sign `end` after them."""
         stop = self._text.find(end, self._end)
         if stop < 0:
             self._start = self._end = len(self._text)

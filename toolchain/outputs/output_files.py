@@ -85,7 +85,7 @@ foreach revision {{{" ".join(revisions)}}} {{
 
 
 class Change(StrEnum):
-    """The effect on a file when the files of its part are written."""
+    """The change to a file when `OutputFiles` are written."""
 
     UNCHANGED = "unchanged"
     CHANGED = "changed"

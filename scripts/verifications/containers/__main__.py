@@ -38,7 +38,7 @@ from toolchain.deployment import load_deployment
 ENGINE: Final = ROOT / "scripts" / "container-engine"
 BUILD_LIMIT = 900.0 * FACTOR
 DOWNLOAD_FAILED, NOT_ABLE, TERMINATED = 3, 4, 143
-"""Exit codes for a failed download and for a machine that cannot run containers, and that of a service after SIGTERM."""
+"""Exit codes: of this command after a failed download, or if it cannot run containers; of a service after SIGTERM."""
 ROBOT_PORT, BOARD_PORT = 9191, 7100
 MINE: Final = "build/mine"
 
