@@ -110,7 +110,7 @@ class LockedRunDirectory:
             ) from error
 
     def release(self) -> None:
-        """Unlock the directory; killed processes may have left sockets in it."""
+        """Remove the sockets that killed processes left in the directory, and unlock it."""
         remove_stale_sockets(self.path)
         os.close(self.lock)
 

@@ -492,7 +492,7 @@ class Session:
         )
 
     def _renew_subscriptions(self) -> None:
-        """Repeat subscriptions without a type, and renew published topics from which no message has come."""
+        """Repeat subscriptions without a type, and renew those to published topics from which no message has come."""
         self._retry_timer = None
         if not self.is_open:
             return  # a new connection begins to check again

@@ -28,7 +28,7 @@ PAUSE = 0.005
 
 
 class Run:
-    """A master, and the times of its cycles (us), each from the end of the one before it."""
+    """A master, and the times of its cycles (us), each from the end of the previous cycle."""
 
     def __init__(
         self, ros: Ros, topic: str, publication: Publication, results: Subscription, frames: Subscription

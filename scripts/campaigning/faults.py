@@ -99,7 +99,7 @@ def ended_roles(fault: Fault) -> tuple[str, ...]:
 
 
 def _reasons(fault: Fault, topology: Topology) -> set[str]:
-    """Return the reasons for losses that a fault explains."""
+    """Return the reasons under which a fault may lose readings or results."""
     if fault.target in {*BOARD_NAMES, BOARDS_PARENT}:
         return {FAILED}
     reasons: set[str] = set()

@@ -139,7 +139,7 @@ class Master:
         return ExitCode.DONE
 
     async def _prepare_peers(self) -> None:
-        """Prepare the peers; the processes of a run that was killed may take a moment to release the run directory."""
+        """Prepare the peers; wait a moment for processes of a killed run that still hold the run directory."""
         deadline = time.monotonic() + self._settings.stop_timeout
         while True:
             try:

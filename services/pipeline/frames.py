@@ -236,7 +236,7 @@ class FrameAssembler:
         )
 
     def needs(self, source: int) -> bool:
-        """Return whether every frame needs a message of this source (its index)."""
+        """Return whether every frame needs a message of the source with this index."""
         return self._readers[source].needed
 
     def stamp_gap(self) -> StampGap | None:

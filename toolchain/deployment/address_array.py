@@ -1,4 +1,4 @@
-"""Conversion of arrays of readings to addresses or codes: one per line, one per replica, or both (thesis 4.4).
+"""Conversion of arrays of readings (one per line, one per replica, or both) to addresses or codes (thesis 4.4).
 
 Each number is converted as in `toolchain.deployment.address`. The numbers of an array are in the order replica after
 replica, and line after line in each. A reading of a sensor is missing either on all lines of a machine or on none.

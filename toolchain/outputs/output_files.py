@@ -100,7 +100,7 @@ class OutputFiles:
     contents: dict[str, Iterable[bytes]]
     """For each path in the deployment's folder, the pieces of the file's content, which can be consumed once."""
     own: re.Pattern[str]
-    """Pattern of the paths of this part; matching files that are not in `contents` are removed."""
+    """Pattern of the paths of all files of this part, also in earlier builds; files not in `contents` are removed."""
 
 
 _MEMORIES: Final = re.compile(
