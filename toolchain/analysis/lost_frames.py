@@ -35,7 +35,7 @@ _POINTS: Final = 16
 """Number of random points from which the probability of a frame is estimated."""
 _SEED: Final = 1
 _MOST_CYCLES: Final = 2**26
-"""Maximum `max_cycles` that the advice may recommend: 0.7 s at 100 MHz."""
+"""Longer frames are tried for the advice until they have at least this many cycles: 0.7 s at 100 MHz."""
 
 
 class LostFrames(NamedTuple):

@@ -53,7 +53,7 @@ class TrueCells:
     rows: NDArray[np.int64]
     """int64[n], the usable rows: every searched dimension has a true value, and it is inside the grid."""
     lines: NDArray[np.int64]
-    """int64[n], for each of these rows, the line of the model's grid that contains the true position."""
+    """int64[n], for each usable row, the line of the model's grid that contains the true position."""
     within: NDArray[np.float64]
     """float64[dimensions, n], the offset of the true position from the centre of its cell, in cells: -0.5 to 0.5."""
     outside: int
