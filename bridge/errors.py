@@ -1,7 +1,7 @@
 """Errors of rosbridge connections, each with one sentence for the user.
 
 `str(error)` states what happened, where, what was expected and, if it helps, what to do. `exit_code` is the
-exit code of a command that ends with the error; classes below these inherit it.
+exit code of a command that ends with the error; other subclasses inherit the code of their base class.
 
 * `BridgeError`: 3, caused by the server, or by what it sent
     * `UsageError`: 2, caused by usage, configuration or credentials

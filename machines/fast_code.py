@@ -238,7 +238,7 @@ def _select(
 
 @jit
 def _show(generators: Generators, frame: _Frame, clocks: int) -> None:
-    """Compute the inverted words of all output bits in the block that begins after `clocks` clocks."""
+    """Compute the inverted bits of the random numbers, as words, for the block that begins after `clocks` clocks."""
     jump(generators.jumps, frame.starts, clocks, frame.states)
     for column in range(frame.inverted.shape[0]):
         for bit in range(frame.inverted.shape[1]):

@@ -145,7 +145,7 @@ def _template(keys: tuple[str, ...]) -> str:
 
 
 def _status(keys: tuple[str, ...], head: tuple[object, ...], values: tuple[object, ...]) -> str:
-    """Return a DiagnosticStatus as JSON: the fields of `head`, then those of the `values` that are not None, by key."""
+    """Return a DiagnosticStatus as JSON: the fields in `head`, then the `values` that are not None, under `keys`."""
     if None in values:
         keys = tuple(key for key, value in zip(keys, values, strict=True) if value is not None)
         values = tuple(value for value in values if value is not None)

@@ -55,7 +55,7 @@ class Plane(NamedTuple):
     def of(cls, dimensions: Sequence[Dimension], *, square: bool = False) -> Self:
         """Return the plane of a result's dimensions.
 
-        A ValueError if they span no plane, or if its cells must be `square` and are not.
+        A ValueError if they span no plane, or if `square` is True and the plane's cells are not square.
         x and y are the variables of these names; with other names, the last one is x.
         """
         if len(dimensions) != 2 or dimensions[0].label == REPLICA:

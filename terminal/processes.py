@@ -41,7 +41,7 @@ def own_command(name: str) -> list[str]:
 
 
 def ask_for_end_with_parent() -> None:
-    """Make the kernel send SIGTERM to this process when its parent exits; this survives an exec."""
+    """Make the kernel send SIGTERM to this process when its parent exits, also after an exec."""
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
 
 

@@ -4,8 +4,8 @@
         master.status.sock  subscriber.sock  board0.sock  ...
 
 Only this user can enter the default directory. A master that starts processes locks the directory (flock), and its
-children inherit the lock. So the kernel releases it when the last of them has ended, even if it was killed. Sockets
-that killed processes leave are replaced at the next start.
+children inherit the lock. So the kernel releases the lock when the last of these processes has ended, even if it was
+killed. The next start replaces the sockets of killed processes.
 """
 
 import contextlib

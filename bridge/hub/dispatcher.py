@@ -1,4 +1,4 @@
-"""Dispatch of messages to clients' outboxes, and the clients that have output, or messages held by a throttle."""
+"""Dispatch of messages to clients' outboxes; lists of the clients with output, and of those with throttled messages."""
 
 from math import inf
 from typing import Final

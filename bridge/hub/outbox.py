@@ -200,7 +200,8 @@ class Outbox:
     def adjust(self, lane: Lane, throttle: float, queue_length: int) -> None:
         """Change a lane's throttle and queue length.
 
-        A message that the throttle no longer holds back is queued; the oldest beyond the new length are dropped.
+        A message that the throttle no longer holds back is queued; messages beyond the new length are dropped, the
+        oldest first.
         """
         # The throttle would have admitted the next message one old interval after the last one; now one new interval.
         lane.next_time += throttle - lane.throttle

@@ -1,4 +1,4 @@
-"""Topics: advertising, publishing, subscribing, latching; subscribers with one encoding share an encoded message."""
+"""Topics: advertising, publishing, subscribing, latching; subscribers to the same encoding share an encoded message."""
 
 import time
 from collections.abc import Callable, Sequence

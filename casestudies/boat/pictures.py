@@ -83,8 +83,8 @@ def stage_shares(instances: Iterable[Instance]) -> tuple[StageShare, ...]:
 def projected_shares(instances: Iterable[Instance], clock_hz: float) -> tuple[StageShare, ...]:
     """Return the stages as they would be with real boards; empty if the frames do not report cycles and bytes.
 
-    The time of computing is the number of cycles that the boards counted, at this clock. The time of the link is that
-    of a model of PCIe for the bytes transferred. The times of host and rosbridge are measured.
+    The time of computing is that of the cycles that the boards counted, at `clock_hz`. The time of the link comes from
+    a model of PCIe, for the bytes transferred. The times of host and rosbridge are measured.
     """
     stages = (
         _STAGES[0],

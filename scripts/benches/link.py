@@ -44,7 +44,7 @@ RESULTS = 4096
 WAYS = {"sent": (), "read": ("--read-results",)}
 """Flags of `board` by the way in which results arrive: in the done message, or by register reads as in the thesis."""
 SLOWER = 20
-"""JTAG is measured once for so many measurements of each other link, because its transfers take milliseconds."""
+"""Number of measurements of each other link per measurement of JTAG, whose transfers take milliseconds."""
 TOLERANCE = 0.15
 """Maximum relative deviation of a fitted rate from the stated one."""
 LIMIT_S = 30.0

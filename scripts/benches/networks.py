@@ -1,4 +1,4 @@
-"""BM2 on published networks: distances of its and other Gibbs samplers' marginals from exact inference.
+"""BM2 on published networks: distance of its marginals, and of other Gibbs samplers' marginals, from exact inference.
 
 pgmpy's wheel --> *.bif.gz --> our reader --> BM2, linear and coloured --> marginals --> total variation, per variable
                      └───────▶ pyagrum ─────▶ exact inference ───────────────────────────────────▲
@@ -177,7 +177,7 @@ def variation(found: Marginals, exact: Marginals) -> list[float]:
 
 
 def compare(network: Network, arguments: argparse.Namespace) -> tuple[float, float]:
-    """Print a table; return the machine's largest total variation over median banks of seeds, and over all banks."""
+    """Print a table; return the machine's largest total variation with the median bank of an evidence, and with any."""
     names, sweeps = network.model.names, arguments.sweeps
     zeros = f"{network.zeros} zeros, which limit Gibbs samplers" if network.zeros else "no zeros"
     rows: list[list[str] | None] = []

@@ -88,7 +88,7 @@ _REASONS = {
 
 
 def ended_roles(fault: Fault) -> tuple[str, ...]:
-    """Return the roles that a fault ends, once per end (see `ENDS`); a board also ends when its frame fails."""
+    """Return the roles that a fault ends, once per end (see `ENDS`); a failed frame counts as an end of its board."""
     if fault.what == "misbehave":
         return ("boards", "boards")  # it has been killed before
     if fault.target == BOARDS_PARENT and fault.what == "kill":

@@ -125,7 +125,7 @@ class AdvertisedTopic:
 
 
 def reported_refusals(topics: Iterable[AdvertisedTopic]) -> dict[str, str]:
-    """Return the topics that a server has reported to have refused, each with a sentence that says why."""
+    """Return the topics that a server has reported as refused, each with a sentence that says why."""
     return {
         topic.name: f"{topic.name} cannot be received at {topic.uri}: {shown(status.text[:200])}; {_way_out(topic)}"
         for topic in topics

@@ -21,7 +21,10 @@ _Line = LineResult | list[Annotated[float, msgspec.Meta(ge=0)]]  # JSON has no i
 
 
 def result_from_line(line: bytes, number: int, machine: MachineSection) -> Publish | list[float]:
-    """Parse a line: a result of `pcie-app` with its reading, or probabilities; raise an InputLineError otherwise."""
+    """Parse a line: either a `pcie-app` result with its reading, or a list of probabilities.
+
+    Any other line raises an InputLineError.
+    """
     where = f"line {number} of standard input"
     count, replicas, reasons = machine.results, machine.replicas, machine.kind.reasons
     expected = f"a result of pcie-app or an array of {count} probabilities"

@@ -85,7 +85,7 @@ def advise(
     options: AdviceOptions,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """Compare the machines for a model at the same accuracy with exact inference on this host, and recommend one.
+    """Compare the machines for a model, at the same accuracy, with exact inference on this host, and recommend one.
 
     For example `toolchain advise asia.bif --searched bronc --known smoke,dysp --accuracy 0.01`
     """

@@ -41,7 +41,7 @@ class FittedRecording(Section):
 
 
 class FittedVariable(Section):
-    """`[[variable]]` of a fit file; with the method `counts` it has only name and rows, and its table is elsewhere."""
+    """`[[variable]]` of a fit file; with the method `counts`, only name and rows, because the `.npz` has its table."""
 
     name: str
     rows: int = Field(ge=0)

@@ -163,10 +163,10 @@ class Model:
     prior: NDArray[np.float64] | None = None
     """P(S), float64[lines] summing to 1; None for a uniform prior, or for the mean of the rows of `prior_select`."""
     prior_select: PriorSelect | None = None
-    """The variable that selects the prior; then `prior` is the prior without a selection."""
+    """The variable that selects the prior; if there is one, `prior` applies while nothing is selected."""
     transition: Transition | None = None
-    """The change of the searched variable between frames, for a filter; then `prior` is the prediction for the first
-    frame."""
+    """The searched variable's change between frames; only for a filter, whose prediction for the first frame is
+    `prior`."""
 
     def __post_init__(self) -> None:
         name = self.name if isinstance(self.name, str) else ""  # a user's file is not type-checked

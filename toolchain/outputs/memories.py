@@ -78,7 +78,7 @@ def memories(deployment: Deployment, images: Sequence[Image]) -> tuple[Memory, .
 
 
 def column_name(board: int, column: int, sensors: int) -> str:
-    """Return the file name of a board's column, counted from 1, with as many digits as the number `sensors` has."""
+    """Return the file name of a board's column, whose number counts from 1 and is padded to the width of `sensors`."""
     return f"board{board}_column{column:0{len(str(sensors))}d}.mif"
 
 

@@ -290,7 +290,7 @@ python -c "from urllib.request import urlopen; print(urlopen('http://127.0.0.1:8
 
 
 def check_cluster(stack: Stack) -> None:
-    """Check that the profile `cluster` starts only dask, which gives the same bytes as one process."""
+    """Check the profile `cluster`: only dask starts, and its results have the same bytes as those of one process."""
     with stack.cleared():
         try:
             stack.compose("--profile", "cluster", "up", "--detach", limit=UP_LIMIT)
