@@ -44,7 +44,7 @@ class Filler:
 
         Args:
             defaults: The defaults of all fields, which must not be changed.
-            varying: Defaults that differ from message to message: stamps, and the other ROS version's fields of a time.
+            varying: Defaults that differ from message to message: stamps, and a time's fields of the other ROS version.
             parts: The fields that are messages, or arrays of messages, with their fillers.
             is_time: Whether the type is a time or a duration.
         """

@@ -19,7 +19,7 @@ module bm1_table #(parameter FILE_NAME = 0, WORD_BITS = 1, DEPTH = 1, ADDRESS_BI
   assign data_o = anything;
 endmodule
 """
-"""Verilog of a table whose output may be anything at any time, which replaces each table."""
+"""Verilog that replaces each table by one whose output may be anything at any time."""
 
 _INDUCTION: Final = (
     "sat -verify -prove-asserts -set-assumes -tempinduct -seq 1 -maxsteps 4 "

@@ -256,7 +256,7 @@ def show(all_: dict[str, Measured], arguments: argparse.Namespace) -> None:
 
 
 def bench_either(arguments: argparse.Namespace) -> Awaitable[int]:
-    """Compare the stack with the echo, or with `--sizes` measure it for several sizes of the problem."""
+    """Compare the stack with the echo; with `--sizes`, measure the stack for several sizes of the problem."""
     if arguments.sizes:
         from scripts.benches.sizes import bench_sizes  # which needs this module
 

@@ -77,7 +77,7 @@ _ENDS_LINK = {"kill", "corrupt", "repeat", "cut", "finish", "cut-inside", "memor
 _FAILS_BOARD = {*_ENDS_LINK, "stop", "hold"}
 _CUTS_ROSBRIDGE = {"gone", "finish", "nonsense", "cut-inside", "files"}
 _SILENCE = 9.0
-"""Seconds for which a server may be silent; a client gives up a connection that is silent for 10 s."""
+"""Seconds of silence above which a server may lose its clients; they give up a connection after 10 s."""
 _REASONS = {
     "pcie-app": {WITH_APP},
     "publisher": {WITH_PUBLISHER, ROSBRIDGE_AWAY},

@@ -115,7 +115,7 @@ class PeerEvents(Protocol):
         """Handle a record about a reading, a frame or a result."""
 
     def lost(self, peer: Peer) -> None:
-        """Handle the loss of a peer, and of the frame or the results that it had."""
+        """Handle the loss of a peer: count the frame or the results that are lost with it."""
 
     def awaited(self, peer: Peer) -> Awaited | None:
         """Return what a ready peer has to do next; None if nothing."""

@@ -23,8 +23,8 @@ def report_of(
 ) -> FrameReport:
     """Return the report of a frame.
 
-    `now` is the Unix time and the monotonic time, in ns; `previous_out_ns` is how long the previous result took to
-    send.
+    `now` is the Unix time and the monotonic time, in ns; `previous_out_ns` is the time that sending the previous
+    result took.
     """
     result = publish.result
     sent_ns, tick = now

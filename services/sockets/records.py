@@ -180,7 +180,7 @@ class FrameRequest(Record, tag="frame", frozen=True):
 class FrameResult(Record, tag="result", frozen=True):
     """pcie-app to master: the results of the boards, durations, and the bytes and transfers on the links.
 
-    `boards` is a list of `machines.kind.BoardResult`, which only its sender and the publisher read.
+    `boards` is a list of `machines.kind.BoardResult`, not decoded, because a master without a filter only passes it on.
     """
 
     number: int

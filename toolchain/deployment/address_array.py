@@ -200,7 +200,7 @@ def _codes(
 
 
 def _check_missing(variable: Variable, addresses: NDArray[np.int64]) -> None:
-    """Raise an error for a reading that is missing only on some lines, which would favour these lines."""
+    """Raise an error for a reading that is missing on some lines only, because those lines would be favoured."""
     missing = addresses == MISSING
     partly = missing.any(axis=-1) & ~missing.all(axis=-1)
     if partly.any():

@@ -148,7 +148,7 @@ class Deployment(DeploymentFile):
         return next((variable for variable in self.variables if variable.kind == "prior_select"), None)
 
     def machine_addresses(self, addresses: Iterable[int | None]) -> tuple[tuple[int | None, ...], int]:
-        """Split the addresses of all variables into those of the columns, None if missing, and the row of the prior."""
+        """Split the addresses of all variables into those of the columns (None: missing) and the row of the prior."""
         sensors: list[int | None] = []
         row = 0
         for variable, address in zip(self.variables, addresses, strict=True):

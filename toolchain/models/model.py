@@ -161,7 +161,7 @@ class Model:
     known: tuple[Known, ...]
     """The known variables in the order of the machine's columns, 1 to N."""
     prior: NDArray[np.float64] | None = None
-    """P(S), float64[lines] summing to 1; None for a uniform prior, or for the mean of the rows of `prior_select`."""
+    """P(S), float64[lines] summing to 1; None means uniform or, with `prior_select`, the mean of its rows."""
     prior_select: PriorSelect | None = None
     """The variable that selects the prior; if there is one, `prior` applies while nothing is selected."""
     transition: Transition | None = None

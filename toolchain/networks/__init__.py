@@ -71,7 +71,7 @@ def _suffix(path: Path) -> str:
 
 
 def _unpacked(path: Path, data: bytes) -> bytes:
-    """Return the content of a compressed file, of bounded size."""
+    """Return the content of a compressed file; a NetworkFileError if it is damaged or too large."""
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
             content = file.read(MAX_BYTES + 1)

@@ -26,7 +26,7 @@ PROBE: Final = {
     "retries": 4,
     "start_period": f"{240 * FACTOR:g}s",
 }
-"""Settings of health checks; probes take CPU time, so a slow machine has fewer."""
+"""Settings of health checks. Probes take CPU time, so a slow machine makes fewer."""
 
 
 def home() -> Path:
