@@ -166,7 +166,7 @@ class TableNumbers:
     table: npt.NDArray[np.uint32]
 
     def restart(self, bank: int) -> Words:
-        """Return the initial indices."""
+        """Return the generators' first indices in the seed set `bank`."""
         shape, sets = self.parameters.generator_shape, self.parameters.rng_banks * self.parameters.chains
         count, own = math.prod(shape), seed_set(self.parameters, bank)
         # Python integers, because the products may exceed 64 bits

@@ -173,7 +173,7 @@ def runs(mask: int) -> list[tuple[int, int]]:
 
 
 def texts(register_map: RegisterMap) -> dict[str, str]:
-    """Return the contents of all files, by path."""
+    """Return the contents of all files generated from the register map, by path."""
     environment = Environment(
         loader=FileSystemLoader(Path(__file__).with_name("register_templates")),
         undefined=StrictUndefined,

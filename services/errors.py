@@ -29,7 +29,7 @@ class OtherPeerError(StackError):
 
 
 class NoDataError(StackError):
-    """No first reading arrived in time after the start of the run."""
+    """The first reading did not arrive in time after the start of the run."""
 
     exit_code = ExitCode.ROSBRIDGE
 

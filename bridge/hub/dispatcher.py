@@ -32,7 +32,7 @@ class Dispatcher:
         """Units of work in the current turn (see `bridge.hub.topics.TURN_WORK`)."""
 
     def mark_ready(self, client: Client) -> None:
-        """Add a client to the clients with output, once."""
+        """Add a client to the list of clients with output, unless it is already there."""
         if not client.is_ready:
             client.is_ready = True
             self._ready.append(client)

@@ -259,7 +259,7 @@ class WebSocketTransport(asyncio.Protocol):
         self._flush()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Report the end."""
+        """Report the end of the connection."""
         self._receive_eof()
         self.is_open = False
         self._lost.set()

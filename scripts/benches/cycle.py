@@ -66,7 +66,7 @@ def quantile(values: list[float], share: float) -> float:
 
 
 def processes_of(pid: int) -> dict[str, list[int]]:
-    """Return the process numbers of a process and its descendants, by command."""
+    """Return the ids of a process and its descendants, by command."""
     words = Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")
     found = {Path(words[1].decode() if b"python" in words[0] else words[0].decode()).name: [pid]}
     for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split():

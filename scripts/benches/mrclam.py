@@ -175,7 +175,7 @@ async def bench(arguments: argparse.Namespace) -> int:
 
 
 def cells(text: str) -> int:
-    """Return the value of --cells; four boards hold 4096 lines each."""
+    """Return the value of --cells, the width and height of the grid; at most 128, because four boards hold 4 x 4096."""
     if not 1 <= int(text) <= 128:
         raise argparse.ArgumentTypeError("must be 1 to 128")
     return int(text)

@@ -39,7 +39,7 @@ async def measure(some: list[dict[str, int]]) -> float:
 
 
 async def bench(arguments: argparse.Namespace) -> int:
-    """Measure round after round, and print the median of the ratios."""
+    """Measure in several rounds, and print the median of the rounds' ratios."""
     rounds = range(arguments.rounds)
     ratios = [await measure(readings(seed, arguments.frames)) for seed in rounds]
     spread = f"{statistics.median(ratios):.3f} ({min(ratios):.3f} to {max(ratios):.3f})"

@@ -72,7 +72,7 @@ class Proxy:
             self._server = await asyncio.start_unix_server(self._serve, self._listen)
 
     def vanish(self) -> None:
-        """Cut all connections, and refuse others."""
+        """Cut all connections, and refuse new ones."""
         if self._server is not None:
             self._server.close()
         self.cut()

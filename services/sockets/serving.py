@@ -64,11 +64,11 @@ class Link(Protocol):
         self.send(Notice(level, sentence))
 
     async def __aenter__(self) -> Self:
-        """Start to serve."""
+        """Open the link, so that a master can connect."""
         return self
 
     async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        """Stop."""
+        """Close the link."""
 
 
 MakeLink = Callable[[Callable[[AnyRecord], None]], Link]

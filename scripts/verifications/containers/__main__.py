@@ -60,7 +60,7 @@ def check_up(stack: Stack) -> None:
 
 
 def check_bits(stack: Stack) -> None:
-    """Check that a client container recomputes results exactly."""
+    """Check that a client in a container computes the stack's results again, bit for bit."""
     stack.bits(8)
 
 
