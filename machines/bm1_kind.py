@@ -64,7 +64,7 @@ class BM1Kind(MachineKind):
         return BM1Machine(parameters, sections["prior"], columns, sections.get("rng"))
 
     def registers(self, parameters: BM1Parameters) -> UsedRegisters:
-        """Return the registers; INPUTS replaces SENSORS for several replicas or inputs per cell."""
+        """Return the registers of a board: INPUTS instead of SENSORS if it has replicas, or cells their own inputs."""
         inputs, results = math.prod(parameters.input_shape), math.prod(parameters.count_shape)
         size = f"{parameters.sensors} sensors and {parameters.lines} lines"
         if not _is_plain(parameters):

@@ -83,7 +83,7 @@ class BM2Kind(MachineKind):
         return BM2Machine(parameters, tables, supports, sections.get("rng"))
 
     def registers(self, parameters: BM2Parameters) -> UsedRegisters:
-        """Return the registers. The number of lines is 1, as each board runs one chain of the whole model."""
+        """Return the registers of a board; its number of lines is 1, because it runs one chain of the whole model."""
         words = parameters.state_words
         if parameters.stream * words > STREAM_WORDS_MAX:
             raise ParameterError(

@@ -304,7 +304,7 @@ def _mask(first: int, end: int, mask: Words) -> None:
 def _cycle_of(
     words: Words, places: npt.NDArray[np.uint32], width: int, mask: Words, line: int, nth: int
 ) -> int:
-    """Return the cycle of a block in which a line's masked bit is 1 for the `nth` time; there must be `nth` ones."""
+    """Return the cycle of a block in which a line's masked bit is 1 for the `nth` time, which must be in the block."""
     word = 0
     while True:
         made = mask[word]

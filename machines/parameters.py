@@ -48,7 +48,7 @@ _LFSR_BITS: Final = {RngKind.LFSR8: 8, RngKind.LFSR16: 16, RngKind.LFSR24: 24, R
 
 
 class RngReset(StrEnum):
-    """Start of a frame's random numbers: the seeds of the frame's bank, or the end of the previous frame (`free`)."""
+    """Start of a frame's random numbers: the seeds of its bank, or (`free`) where the previous frame ended."""
 
     BANK = "bank"
     FREE = "free"

@@ -8,7 +8,7 @@ from terminal.output import say, warn
 
 
 def report_waits() -> Callable[[str, str, str], None]:
-    """Return a callback for the states of servers; it prints which servers a starting command waits for."""
+    """Return a callback for the states of servers that prints, during a command's start, which ones it waits for."""
     missing: set[str] = set()
 
     def on_state(uri: str, state: str, reason: str) -> None:

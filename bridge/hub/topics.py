@@ -382,7 +382,7 @@ class Topics:
 
 
 def _learn_envelope(advertisement: Advertisement, name: str, raw: bytes) -> None:
-    """Store the envelope of a `publish` operation, by which the topic's next ones are known, if it has a usable one."""
+    """Store the bytes of a `publish` operation before its message, if they suffice to identify the topic."""
     client, envelope = advertisement.client, envelope_of(raw)
     if envelope and topic_of(envelope) == name:
         _forget_envelope(advertisement)

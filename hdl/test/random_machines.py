@@ -38,7 +38,7 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Size and modes of the machine, for people."""
+        """Size and modes of the machine, for reports."""
         p = self.image.machine.parameters
         return (
             f"case {self.seed}: {p.lines} x {p.sensors}, codes {p.prob_bits}, counters {p.counter_bits}, {p.rng}, "

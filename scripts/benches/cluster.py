@@ -96,7 +96,7 @@ class Recording:
 
 
 class Hosts:
-    """A scheduler, and workers of one core each: on this host, or each in a network namespace."""
+    """A scheduler and workers of one core each, all on this host, or each in its own network namespace."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder

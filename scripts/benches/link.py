@@ -179,7 +179,7 @@ def measure_frames(folder: Path, way: str, boards: int, repeats: int) -> Frames:
 
 
 def fits(transfers: Transfers) -> list[Fitted]:
-    """Fit a rate and the latency of one transfer to the times of one board, less those of the socket alone."""
+    """Fit the rate and latency of a transfer to the times of one board, after subtracting those of the bare socket."""
     found = []
     for link, direction in itertools.product((LinkRate.PCIE_GEN2, LinkRate.JTAG), ("write", "read")):
         those, alone = (

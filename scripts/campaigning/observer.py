@@ -22,7 +22,7 @@ class Flaw(StrEnum):
     """A kind of wrong behaviour."""
 
     MALFORMED = "malformed"
-    """The message does not have the form that the page about topics describes."""
+    """The message does not have the form that docs/reference/topics.md describes."""
     WRONG = "wrong"
     """The posterior is not the correct one for its reading, or the report describes another frame."""
     UNKNOWN = "unknown reading"

@@ -56,7 +56,7 @@ def driver_input(deployment: Deployment, frame: FrameRequest, stop: str) -> Fram
 
 
 def machine_inputs(deployment: Deployment, addresses: Addresses) -> tuple[npt.NDArray[np.int64], PriorRow]:
-    """Return inputs (-1: missing) and the row of the prior, for a machine that takes arrays of readings."""
+    """Return a frame's inputs (-1 for a missing one) and its row of the prior, for a machine that reads arrays."""
     variables = deployment.variables
     if len(addresses) != len(variables):
         raise FrameInputError(

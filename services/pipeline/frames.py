@@ -71,7 +71,7 @@ class _SourceReader:
         return to_addresses(self._deployment, variable, value), None
 
     def _require_all(self, message: dict[str, Any]) -> None:
-        """Raise one error that names all missing readings of a message; do nothing if there is one and it is null."""
+        """Raise an error that names all missing readings of a message, unless there is only one and it is null."""
         # often several are missing, such as all of one sensor
         needed = [field for variable, field in self._fields if variable.on_missing == "error"]
         if self._prior is not None and not self._prior_optional:

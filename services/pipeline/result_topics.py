@@ -94,7 +94,7 @@ class ResultTopics:
             yield f"publishing on {topics} at {', '.join(by_uri)}"
 
     def served_by(self, uri: str) -> tuple[str, str]:
-        """Return two texts for the user: the topics at a server, and its name (`rosbridge` if there is no other)."""
+        """Return two texts for the user: a server's topics (empty if it is the only server), and its name."""
         if len(self.rosbridges) == 1:
             return "", "rosbridge"
         topics = [publication.topic for ros, publication in self._outputs if ros is self.rosbridges.get(uri)]

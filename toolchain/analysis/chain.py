@@ -27,7 +27,7 @@ MOST_BITS: Final = 9
 """Maximum number of unknown bits: the matrix of a sweep has 2**bits rows and columns."""
 _MOST_READINGS: Final = 64
 _WORK: Final = 2**27
-"""Maximum number of multiplications of one matrix product, summed over all readings: a few seconds in all."""
+"""Maximum number of readings times multiplications of one matrix product, so that all take a few seconds."""
 
 
 def agreement(

@@ -90,7 +90,7 @@ class Of(StrEnum):
     MEMORY = "memory"
     """A whole memory of the words that the host writes, in bm1_words: the logic that fills it at first and reads it."""
     REPLICA = "replica"
-    """One of several replicas, in bm1_control and bm1_readout: its stop, stop reason, resume and outcome."""
+    """One of several replicas, in bm1_control and bm1_readout: logic of its stop, stop reason, resume and outcome."""
 
 
 WORST_ERROR: Final = 0.06

@@ -75,7 +75,7 @@ class Replay:
     machines: Sequence[Any]
     frames: Frames
     earlier: Callable[[int], tuple[_Posterior, int] | None] | None = None
-    """Function that returns what an interrupted run computed for a row, if anything; needed only for a sequence."""
+    """Function that returns what an interrupted run computed for a row, if anything; needed only if `is_sequence`."""
 
     @property
     def is_sequence(self) -> bool:

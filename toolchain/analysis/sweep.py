@@ -52,8 +52,8 @@ class Point(BaseModel):
         quantising: The same distance for exact inference on the codes.
         map_agreement: Share of all frames with a posterior and the same most probable line.
         alone_total_variation: The mean distance over only the frames with a posterior; None if no frame has one.
-        alone_map_agreement: The share of these frames that have the same most probable line; None likewise.
-        kl_bits: KL(machine || model) in bits, mean over these frames; None likewise.
+        alone_map_agreement: The share of these frames that have the same most probable line; None if there are none.
+        kl_bits: KL(machine || model) in bits, mean over these frames; None if there are none.
         z_rms: Root mean square of z-scores (`ZScores`), ideally 1; None if no line's expected count is high enough.
         without: Share of runs without a posterior.
         cycles_median: Median cycles of a frame.

@@ -45,7 +45,7 @@ class Term:
 
 
 def reduced(term: Term, values: Mapping[str, int]) -> Term:
-    """Return the term with some of its symbols, by name, at fixed values."""
+    """Return the part of a term in which the symbols named in `values` have these values."""
     if not any(name in values for name in term.scope):
         return term
     at = tuple(values.get(name, slice(None)) for name in term.scope)

@@ -72,7 +72,7 @@ class TabulatedVariable:
     offset: float = 0.0
     """The reading with address 0, in the unit of the variable."""
     step: float = 1.0
-    """Difference between adjacent addresses, in the unit of the variable."""
+    """Difference between the readings of adjacent addresses, in the unit of the variable."""
     unit: str = ""
     """The unit of its readings, such as m, which is shown next to them."""
     period: int | None = None

@@ -222,7 +222,7 @@ def check_absent_robot(stack: Stack) -> None:
 
 
 def check_own_model(stack: Stack) -> None:
-    """Check a user's model with readings from another container; `toolchain build` makes first a BM1, then a BM2."""
+    """Check a user's model with readings from another container, first built as a BM1, then as a BM2."""
     topic = ("--topic", "/mine/readings", "--type", "std_msgs/Float64MultiArray")
     source = ("--uri", "ws://127.0.0.1:9090", *topic)
 
