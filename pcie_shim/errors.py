@@ -20,7 +20,7 @@ class CredentialsError(PcieShimError):
 
 
 class ImageError(PcieShimError):
-    """A programming file that cannot be created or used, such as a model too large for the interface."""
+    """A programming file that cannot be created or used, for example if the model is too large for the interface."""
 
     exit_code = 2
 

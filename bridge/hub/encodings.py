@@ -132,5 +132,5 @@ class OutgoingMessage:
 
 @lru_cache(maxsize=1024)
 def _cbor_prefix(name: str) -> bytes:
-    """Return the bytes before the CBOR of a message of topic `name`: a map of three entries, up to the last value."""
+    """Return the bytes of a publish operation in CBOR before its message, for the topic `name`."""
     return b"\xa3" + b"".join(map(cbor2.dumps, ("op", "publish", "topic", name, "msg")))

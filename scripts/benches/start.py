@@ -25,7 +25,7 @@ from terminal.processes import own_command
 LIMIT = 900.0
 """Time limit, in seconds."""
 LOOK_EVERY = 0.002
-"""Seconds between two looks for files."""
+"""Seconds between two checks for files."""
 LINES = {
     "first line": "",
     "publisher connected": "publisher: ",

@@ -47,7 +47,7 @@ class Visit:
     Attributes:
         page: Playwright's page.
         complaints: Errors on the console, uncaught exceptions, and requests to other computers.
-        may_lose_server: Ignore the errors of failed requests; True while the dashboard restarts.
+        may_lose_server: Whether to ignore errors of failed requests, as while the dashboard restarts.
     """
 
     def __init__(self, page: Any) -> None:
@@ -143,7 +143,7 @@ class Visit:
         return float(await self.page.evaluate("window.moved"))
 
     async def mean_near(self, to: Place) -> float:
-        """Wait until a posterior with its mean near `to` is painted after a drag; return its browser time."""
+        """Wait until a posterior with its mean near `to` is painted after a drag; return the browser's time."""
         found = await self.until(
             """([x, y, near]) => {
                 const {clientWidth, clientHeight} = document.querySelector('[data-testid=posterior]');

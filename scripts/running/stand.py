@@ -128,7 +128,7 @@ class Stand:
         self._commands["dashboard"] = (*command, str(urlsplit(self.url).port))
 
     def _where(self, name: str) -> tuple[str, ...]:
-        """Return the flags for the hub and for the run directory of a master."""
+        """Return the flags with the URI of the hub, and with a new run directory for the process `name`."""
         (run := self.folder / f"run-{name}").mkdir(mode=0o700, exist_ok=True)
         return "--uri", self.uri, "--run-directory", str(run)
 

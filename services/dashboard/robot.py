@@ -59,7 +59,7 @@ class WatchedRobot:
         state: State of the connection in words.
         connected: Whether there is a connection.
         landmarks: x, y and name of each landmark.
-        switches: The simulated world's switches by service name, with the value last set here, at first True.
+        switches: By service name, the value last set here of each switch of the simulated world; at first True.
         can_set_pose: Whether the topic that moves the simulated boat has a subscriber.
         lost: Lost frames by reason, as the processes of the stack count them.
         boards: Endpoint, state and image of each board.

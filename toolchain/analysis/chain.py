@@ -88,7 +88,7 @@ class ExactChain:
         return laws
 
     def _tries(self, move: Sequence[int]) -> NDArray[np.float64]:
-        """Return the mean number of cycles of a move in each state; it ends when the CDEs have agreed on all its bits."""
+        """Return the mean number of cycles, in each state, until the CDEs have agreed on all bits of a move."""
         agree = self._one[move] + self._zero[move]
         total = np.zeros(agree.shape[1])
         for count in range(1, len(move) + 1):

@@ -43,7 +43,7 @@ class FrameRun:
 
 
 class EmulatedBoards:
-    """Boards among which the lines of one machine are divided; a BuildError if the target does not fit the counters."""
+    """Boards among which the lines of one machine are divided; a BuildError if `target_count` exceeds the counters."""
 
     def __init__(
         self, machines: Sequence[BM1Machine], *, target_count: int, max_cycles: int, stop: Stop

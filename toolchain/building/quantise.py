@@ -21,7 +21,7 @@ from toolchain.models.conditional import middle_bin
 from toolchain.models.model import Known, Model
 
 _HALVINGS: Final = 12
-"""Number of bisection steps between the logarithms of a floor and of 1, enough for the two reported digits."""
+"""Number of bisection steps in the search for an outlier floor below 1; enough for the two reported digits."""
 
 _ROUNDING: Final = 1e-12
 """Divergences in bits below this are only rounding errors of float64."""

@@ -67,7 +67,7 @@ class Transition:
 
     @classmethod
     def read(cls, path: Path, lines: int, sha256: str) -> "Transition":
-        """Read the file of a deployment, or raise a DeploymentError."""
+        """Read the start and transition in the file of a filter, or raise a DeploymentError."""
         if not path.is_file():
             raise DamagedDeploymentError(
                 f"{path}, the filter's start and transition, does not exist: build it again with 'toolchain build'"
