@@ -47,7 +47,7 @@ FACTOR_VARIABLES_MAX: Final = 32
 """Maximum number of variables of a factor: its array has an axis for each."""
 
 SEARCH_MAX: Final = 150_000
-"""Maximum number of steps in the search for a start state; they take about a second."""
+"""Maximum work of the search for a start state, in arbitrary units; it takes about a second."""
 
 
 class BM2StopReason(IntEnum):
@@ -443,7 +443,7 @@ def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bo
     `largest` is for every second board: chains that start far apart show whether they mix.
 
     Raises:
-        StartError: A value is out of range, or the search takes more than `SEARCH_MAX`.
+        StartError: A value is out of range, or the work of the search exceeds `SEARCH_MAX`.
     """
     parameters = machine.parameters
     domains = [np.ones(cardinality, dtype=np.bool_) for cardinality in parameters.cardinalities]

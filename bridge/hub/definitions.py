@@ -78,7 +78,7 @@ class MessageDefinitions:
         return self._filler(known)
 
     def fillers(self, type_name: str, kind: Literal["srv", "action"]) -> dict[str, Filler]:
-        """Return the fillers of the parts of a service or an action, such as `Request`, by part; unknown parts are left out."""
+        """Return the fillers of the parts of a service or an action, such as `Request`, as far as they are known."""
         fillers = {part: self.filler(part_name(type_name, part, self.ros_version)) for part in PARTS[kind]}
         return {part: filler for part, filler in fillers.items() if filler is not None}
 

@@ -61,7 +61,7 @@ def memories(
     ] = None,
     verbose: Verbose = False,
 ) -> None:
-    """Write the parameters and memory files again; with --model also the images, with new numbers.
+    """Write the parameters and memory files again; with --model also the images, with the tables of the model.
 
     For example `toolchain regenerate memories build/boat --model casestudies/boat`. Everything else in
     deployment.toml, such as topics and endpoints, does not change.

@@ -257,7 +257,7 @@ class Links:
         return before
 
     def drawn(self, path: Sequence[str]) -> str:
-        """Return a path as text with arrows, shortened if it is long; two parents are joined through their common child."""
+        """Return a path as text with arrows, shortened if it is long; two parents are joined by their common child."""
         arrows = [self._arrow(before, after) for before, after in pairwise(path)]
         if len(path) > _LONGEST_DRAWN:
             arrows[_SHOWN:-_SHOWN] = [f" ... {path[-1 - _SHOWN]}"]

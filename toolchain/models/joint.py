@@ -298,7 +298,7 @@ class Question:
         """Return the factors relevant for all observed symbols, and the pairs that they join, with lengths of paths.
 
         Only these pairs may be dependent. To find out whether a pair is, use the factors relevant for that pair alone.
-        Those factors are a part of the returned ones, so the pair's path through them is at least as long.
+        Those factors are a part of the returned ones, so the pair's path through them has at least the returned length.
         """
         observed = [symbol.name for symbol in self.observed]
         factors, links = self._linked(self.joint.active, observed)

@@ -60,7 +60,7 @@ SCALE: Final = 4.0
 """Pixels a metre in boat.rviz."""
 BACKGROUND: Final = (48, 48, 48)
 FEW: Final = 50
-"""Maximum number of pixels with the background's colour in a row or column outside the scene, such as in text."""
+"""A row or column with at most this many pixels of the background's colour, such as in text, is outside the scene."""
 
 
 class Scene(NamedTuple):
