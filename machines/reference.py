@@ -12,8 +12,8 @@ from machines.rng import random_numbers
 class ReferenceBM1(BM1Kernel):
     """A kernel for any machine that runs cycle by cycle (thesis 2.1.2, figure 2.4).
 
-    In every cycle, all replicas use the same random numbers. Each compares them with its own codes, counts
-    and stops by itself; the generators step until the last one has stopped.
+    In every cycle, all replicas use the same random numbers. Each compares them with its own codes, and
+    counts and stops by itself; the generators step until the last replica has stopped.
     """
 
     def __init__(self, machine: BM1Machine) -> None:

@@ -34,7 +34,7 @@ QUEUE_SIZE: Final = 64
 FIRST_TIMEOUT: Final = 30.0
 """Default timeout for the first posterior, in seconds."""
 _DISORDER_NS: Final = 50_000_000
-"""Maximum nanoseconds by which a report, although published first, may arrive after its posterior."""
+"""Maximum delay of a report after its posterior, in ns: reports are published first, but may arrive second."""
 _REPORT_TIMEOUT: Final = 1.0
 """Seconds that a posterior waits for its report."""
 

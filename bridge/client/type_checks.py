@@ -1,4 +1,4 @@
-"""Checks of what a client sends against the definitions of types, which rosapi knows.
+"""Checks of the data that a client sends against the definitions of their types, which rosapi knows.
 
 rosapi is a node that runs beside most rosbridge servers, and answers service calls below `/rosapi`.
 """

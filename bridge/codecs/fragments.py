@@ -28,7 +28,7 @@ MAX_FRAGMENTS: Final = 1 << 16
 MAX_AGE: Final = 10.0
 """Seconds without another fragment after which a message is discarded."""
 OVERHEAD: Final = 128
-"""Bytes that each stored fragment counts in addition to its data, so that empty fragments count too."""
+"""Bytes that are added to the size of each stored fragment, so that empty fragments count too."""
 _LONGEST_ID: Final = 1024
 # Value and mask of UTF-8 bytes inside a character.
 _CONTINUATION: Final = 0x80, 0xC0

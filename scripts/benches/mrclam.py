@@ -86,7 +86,7 @@ def exact_distance(
 
 
 async def fit(arguments: argparse.Namespace) -> Model:
-    """Return the model with a file's tables; learn an absent file from robot 3 first, or raise a ProcessError."""
+    """Return the model with the tables of a fit; without its file, fit to robot 3 first, or raise a ProcessError."""
     landmarks = arguments.data / "landmarks.csv"
     if not arguments.fit.exists():
         print(f"learning {arguments.fit} from {RECORDINGS[0]} ...", file=sys.stderr)

@@ -70,7 +70,7 @@ SHORT: tuple[Step, ...] = (
 # --- what a fault explains -------------------------------------------------------------------
 
 ENDS = {"master": 1, "hub": 2, "boards": 3}
-"""How often faults may end a role in a round: boards 3 times, as a board's 4th failure in a minute ends the master."""
+"""Maximum number of ends of a role by faults in a round; a board's 4th failure in a minute would end the master."""
 MOST_ENDS = 2
 """Maximum ends per round of each role that is not in `ENDS`, and of each role's connection to the master."""
 _ENDS_LINK = {"kill", "corrupt", "repeat", "cut", "finish", "cut-inside", "memory"}

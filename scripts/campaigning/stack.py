@@ -139,7 +139,7 @@ class Stack:
         return [*master, *(["--fused"] if self._topology.fused else []), *boards]
 
     async def start_part(self, role: str, misbehave: str = "") -> None:
-        """Start a process that the campaign supervises; raise a NotThereError if it is a server and does not become ready."""
+        """Start a process of the campaign; raise a NotThereError if it is a server and does not become ready."""
         self._starts += 1
         process = Process(role, self._folder / f"{self._starts:03}-{role}.log")
         command = self._command(role, misbehave)

@@ -1,4 +1,4 @@
-"""`subscriber` without a master, which prints variables or addresses."""
+"""The `subscriber` that runs without a master: it prints variables or addresses."""
 
 import asyncio
 import contextlib

@@ -170,7 +170,7 @@ def _machine_answer(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contents:
-    """A network's variables and, if some are searched, those pairs of others of which a BM1 can know only one."""
+    """A network's variables, the searched ones, and for each variable those that a BM1 cannot know together with it."""
 
     joint: JointDistribution
     searched: tuple[str, ...] = ()

@@ -16,7 +16,7 @@ from toolchain.errors import BuildError, NotFusionError, counted
 from toolchain.flags import Bits
 
 RESULTS = Path("build/explore.jsonl")
-"""The default file of results, in the folder of most deployments, which version control ignores."""
+"""The default file of results. Version control ignores its folder, in which most deployments are built."""
 
 
 @contextmanager

@@ -202,7 +202,7 @@ def compare_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change
 
 
 def present(directory: Path, files: OutputFiles) -> list[str]:
-    """Return the paths in the folder that a build of this part replaces or removes."""
+    """Return the paths in the folder that belong to `files`: a build would replace or remove them."""
     folders = ("", "boards", PARAMETERS_FILE.partition("/")[0], MEMORIES_FOLDER)
     paths = [path for folder in folders for path in (directory / folder).glob("*")]
     return [name for path in paths if files.own.fullmatch(name := path.relative_to(directory).as_posix())]
