@@ -64,7 +64,7 @@ class BM1Kind(MachineKind):
         return BM1Machine(parameters, sections["prior"], columns, sections.get("rng"))
 
     def registers(self, parameters: BM1Parameters) -> UsedRegisters:
-        """Return the registers of a board: INPUTS instead of SENSORS if it has replicas, or cells their own inputs."""
+        """Return the registers of a board: INPUTS instead of SENSORS if it has replicas or inputs per cell."""
         inputs, results = math.prod(parameters.input_shape), math.prod(parameters.count_shape)
         size = f"{parameters.sensors} sensors and {parameters.lines} lines"
         if not _is_plain(parameters):
@@ -455,5 +455,5 @@ class _OnHost(HostMachine):
         return [own.astype("<u4").tobytes() for own in self._by_board(by_line)]
 
     def _by_board(self, array: npt.NDArray[_Scalar]) -> list[npt.NDArray[_Scalar]]:
-        """Split an array by its last axis, the lines of all boards."""
+        """Split an array, whose last axis has the lines of all boards, into one array per board."""
         return np.split(array, self._ends[:-1], axis=-1)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from toolchain.deployment import Deployment, Dimension
 
 MAP_FRAME: Final = "map"
-"""The frame of grid and pose, in which the searched variables are coordinates."""
+"""The tf frame of grid and pose, in which the searched variables are coordinates."""
 MOST_OCCUPIED: Final = 98
 """Value of the most probable cell in a grid message, because rviz paints 99 and 100 as obstacles."""
 _HEADING_VARIANCE: Final = math.pi**2 / 3

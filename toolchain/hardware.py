@@ -272,7 +272,7 @@ def _compile_ghdl(image: Image, folder: Path) -> None:
 
 
 def _compile_verilator(image: Image, folder: Path) -> None:
-    """Compile an executable, and write the memories for it."""
+    """Compile an image's hardware to an executable, and write the files of its memories."""
     with tempfile.TemporaryDirectory(prefix=_BUILDING, dir=folder.parent) as where:
         work = Path(where)
         write_board_files(image, work)

@@ -79,7 +79,7 @@ class Advertisement:
     """Fills the absent fields of its messages, if their type is known."""
     latching: bool = False
     ids: set[OperationId] = field(default_factory=set)
-    """Ids of the advertise operations."""
+    """Ids of the advertise operations that have not been withdrawn."""
     envelope: bytes = b""
     """The bytes before the message in a publish operation, once they are known."""
 

@@ -391,4 +391,4 @@ _LONG_LOW: Final = frozenset({rm.CYCLES, rm.COMPUTE_NS})
 _DATA: Final = tuple(
     range(block, block + 4 * block.words) for block in rm.BLOCKS.values() if block >= rm.SENSORS
 )
-"""Addresses of the blocks from SENSORS on; a board implements only the words of them that its image uses."""
+"""Addresses of the blocks from SENSORS on; a board implements only the words that its image uses."""

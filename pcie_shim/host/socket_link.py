@@ -363,7 +363,7 @@ class SocketLink:
     # ---- receiving ------------------------------------------------------------------------------------
 
     def _receive(self, deadline: float, timeout: float, what: str) -> Frame:
-        """Return the next frame of any kind; after the deadline, raise the `timeout_error` of `timeout` and `what`."""
+        """Return the next frame of any kind; after the deadline, raise `timeout_error(timeout, what)`."""
         while (frame := self._next_frame()) is None:
             left = deadline - time.monotonic()
             # an event loop that watches the descriptor may have made it non-blocking (uvloop does)

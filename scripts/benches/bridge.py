@@ -37,7 +37,7 @@ IN_FLIGHT = 32
 WINDOW = {SMALL: 400, LARGE: 100}
 """Maximum number of messages by which a receiving client lags, by number of values: so few that the hub drops none."""
 COUNTS = {SMALL: (12_000, 12_000, 600), LARGE: (1_000, 2_000, 200)}
-"""Number of messages to publish, to receive and to echo in one turn, by number of values: each count takes 50 ms."""
+"""Counts of messages to publish, receive and echo in a turn, by number of values; each count takes 50 ms or more."""
 SERVER_MESSAGES = {"hub": 100_000, "Tornado double": 8_000}
 SERVER_TURNS = 5
 # Bytes of a published message that are searched for the mark of the last one.
@@ -101,7 +101,7 @@ class Child:
 
 @asynccontextmanager
 async def client(name: str, uri: str) -> AsyncIterator[Child]:
-    """Run a client within the context."""
+    """Run a client's process while the context is open."""
     command, environment = [sys.executable, str(SIDES / "our_client.py")], dict(os.environ)
     if name in THEIRS:
         python = str(install_roslibpy() / "venv" / "bin" / "python")

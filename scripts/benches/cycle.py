@@ -31,7 +31,7 @@ STAGES = (
 )
 LINES = 32 * 32
 BOUND = 2.5
-"""Limit of the cycle time, as a multiple of the floor plus computing on the boards."""
+"""Limit of the cycle time, as a multiple of the echo's cycle time plus computing on the boards."""
 WINDOW = 4
 """Number of readings in flight when frames per second are measured."""
 TURN = 50

@@ -9,7 +9,7 @@ from bridge.client import connect
 
 
 async def echo(uri: str, lines: int) -> None:
-    """Answer on /bench/echo until the process is ended, always with the same message."""
+    """Answer each reading on /bench/echo with the same message, until the process is ended."""
     answer = {
         "layout": {"dim": [{"label": "line", "size": lines, "stride": lines}], "data_offset": 0},
         "data": [(at + 0.5) * 2 / lines**2 for at in range(lines)],

@@ -50,7 +50,7 @@ TOLERANCE = 0.15
 LIMIT_S = 30.0
 
 SIZES = tuple(4 * words for words in WORDS)
-"""Bytes of a block."""
+"""Sizes of the transferred blocks, in bytes."""
 
 Move = Callable[[Sequence[SocketLink], int], None]
 Transfers = dict[tuple[LinkRate, str, int, int], float]

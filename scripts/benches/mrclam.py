@@ -37,7 +37,7 @@ Figures = dict[str, Any]
 
 
 LandmarkReading = tuple[float | None, float | None]
-"""A reading of one landmark: range in metres, absolute bearing in radians (of any size); each None if not seen."""
+"""A reading of one landmark: range in metres, absolute bearing in radians (in any turn); each None if not seen."""
 
 
 def unquantised_posterior(

@@ -74,7 +74,7 @@ class Visit:
         return self.page.get_by_test_id(name)
 
     async def until(self, condition: str, argument: Any = None) -> Any:
-        """Wait until a JavaScript function of the argument returns something true, and return that."""
+        """Wait until a JavaScript function of the argument returns a truthy value, and return that value."""
         found = await self.page.wait_for_function(condition, arg=argument, timeout=1e3 * PATIENCE)
         return await found.json_value()
 

@@ -10,7 +10,7 @@ from scripts.running.script import reporting_errors, run_script
 
 
 def positive(text: str) -> int:
-    """Return the value of a flag that is 1 or more."""
+    """Return the value of a flag as an integer, which must be 1 or more."""
     if (number := int(text)) < 1:
         raise argparse.ArgumentTypeError("must be 1 or more")
     return number
@@ -20,7 +20,7 @@ _KINDS: dict[Any, str] = {int: "NUMBER", positive: "NUMBER", float: "NUMBER", Pa
 
 
 class ScriptParser(argparse.ArgumentParser):
-    """A parser whose help shows the kind and default of each value; it takes the first line of `description`."""
+    """A parser whose help shows the first line of `description`, and the kind and default of each value."""
 
     def __init__(self, prog: str, description: str) -> None:
         super().__init__(prog, description=description.splitlines()[0])

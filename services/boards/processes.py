@@ -32,7 +32,7 @@ _ENDING_TIME: Final = 5.0
 _STOPPING_S: Final = 2.0
 """Seconds after which a board that does not end is killed."""
 _LISTENS: Final = 128
-"""Added to the number that a board's process writes to its parent as a sign of life, once, when the board listens."""
+"""Added to a board's number in the sign of life that tells the parent process that the board listens."""
 
 
 def blank_board(index: int, settings: Settings, hardware: SimulatedHardware | None) -> Board:

@@ -103,7 +103,7 @@ class Sweep:
     banks: Annotated[int, typer.Option(help="Number of seed sets for each frame.", min=1)] = 2
 
     def __post_init__(self) -> None:
-        """Refuse malformed lists before a model is read."""
+        """Refuse a malformed list in a flag before a model is read."""
         self._lists()
 
     def _lists(self) -> tuple[tuple[Scale, ...], tuple[RngKind, ...], _Numbers, _Numbers, _Numbers]:

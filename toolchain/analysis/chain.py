@@ -185,9 +185,9 @@ class ChainError:
     share: float
     """The total probability of the readings that were examined, which are the likeliest ones."""
     quantising: float
-    """Mean distance of the stationary law from exact inference."""
+    """Mean distance of the stationary law from exact inference, over the readings."""
     worst: float
-    """The largest distance of the stationary law from exact inference, over readings."""
+    """Largest distance of the stationary law from exact inference, over the readings."""
     worst_reading: tuple[int, ...]
     """The reading with the largest distance (`worst`): an address per known variable."""
     start: float

@@ -28,7 +28,7 @@ ROUNDING: Final = 0.02
 
 
 class Place(Protocol):
-    """The place in its file at which a reader is, for errors."""
+    """A reader's current place in its file, for errors."""
 
     def error(self, sentence: str) -> NetworkFileError:
         """Return an error that starts with the file and the line, followed by the sentence."""

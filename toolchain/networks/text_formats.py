@@ -109,7 +109,7 @@ class Scanner:
         return int(word)
 
     def numbers(self, end: str, wanted: int, what: str, *, between: str = ",") -> NDArray[np.float64]:
-        """Consume float64[wanted], between which the signs `between` are ignored, and the sign `end` after them."""
+        """Consume and return numbers, float64[wanted], ignoring the signs `between`; also consume the sign `end`."""
         stop = self._text.find(end, self._end)
         if stop < 0:
             self._start = self._end = len(self._text)

@@ -189,7 +189,7 @@ class _Served:
 
 
 class ServedServices(_Served):
-    """The services, and their unanswered requests. Each request has a ticket, a number that is never reused."""
+    """This client's services, and their unanswered requests. A request has a ticket, a number that is never reused."""
 
     kind = "service"
 

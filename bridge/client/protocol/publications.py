@@ -105,7 +105,7 @@ class Publications:
         return ros1_type(type_name) in self._definitions
 
     def define(self, type_name: str, definitions: Definitions) -> None:
-        """Store definitions for a type; if the type is among them, check the next message of each such topic."""
+        """Store definitions for a type; if it is among them, check the next message of each topic with that type."""
         self._definitions[ros1_type(type_name)] = definitions
         for advertised in self._advertised.values():
             if same_type(advertised.type, type_name):
