@@ -122,7 +122,7 @@ class Filter:
         """P(S | all readings so far), float64[lines]; after `predict`, P(S) of the next frame before its readings."""
 
     def predict(self, steps: int = 1) -> NDArray[np.uint16]:
-        """Move the belief `steps` frames on, and return the prior of the frame then reached, as codes: uint16[lines]."""
+        """Move the belief `steps` frames on, and return the codes of the prior of the frame reached: uint16[lines]."""
         self.belief = self.transition.after(self.belief, min(steps, self.most_steps))
         return prediction_codes(self.belief, self._prob_bits)
 
