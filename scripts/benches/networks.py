@@ -177,7 +177,7 @@ def variation(found: Marginals, exact: Marginals) -> list[float]:
 
 
 def compare(network: Network, arguments: argparse.Namespace) -> tuple[float, float]:
-    """Print a table; return the machine's largest total variation with the median bank of an evidence, and with any."""
+    """Print a table; return the machine's largest total variation: over each evidence's median bank, and over all."""
     names, sweeps = network.model.names, arguments.sweeps
     zeros = f"{network.zeros} zeros, which limit Gibbs samplers" if network.zeros else "no zeros"
     rows: list[list[str] | None] = []

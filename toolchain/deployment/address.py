@@ -60,8 +60,8 @@ def _missing(variable: Variable, what: str) -> int | None:
 def _unserved(variable: Variable, value: float, beyond_top: bool | None) -> int | None:
     """Return the address that `on_range` gives a value out of range, None for missing, or raise an error.
 
-    `beyond_top` is True if the value lies beyond the variable's last value, False if before its first; None if the
-    variable is periodic, so that neither end is nearer.
+    `beyond_top` is True if the value lies beyond the variable's last value, False if before its first. It is None for
+    an infinite value of a periodic variable, which is nearer to neither.
     """
     if variable.on_range == "missing":
         return _missing(variable, f"is {_shown(value)}, out of range")

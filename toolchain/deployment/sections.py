@@ -176,7 +176,7 @@ class Scale(StrEnum):
     ADDRESS = "address"
     """Each row, the part of the table for one address; with this choice, the machine needs the fewest cycles."""
     COLUMN = "column"
-    """The whole table of a column, divided by its one maximum."""
+    """The whole table of a column, which keeps the ratios of its rows."""
     NONE = "none"
     """No division: the codes are those of the raw probabilities."""
 
