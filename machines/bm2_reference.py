@@ -123,7 +123,7 @@ class ReferenceBM2(BM2Kernel):
         self._move_cycles = 0
 
     def _take_sample(self) -> None:
-        """Count the state in the histogram of every unknown variable, and in the joint one of those searched."""
+        """Count the state in each unknown variable's histogram and in the joint histogram of the searched variables."""
         parameters = self._parameters
         self.samples += 1
         if parameters.stream:

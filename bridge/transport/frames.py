@@ -170,7 +170,7 @@ def mask_keys(count: int) -> list[bytes]:
 
 
 class _Headers(dict[int, bytes]):
-    """The headers of frames by the lengths of their payloads, up to the masking key if there is one."""
+    """The headers of frames, without the masking key, by the lengths of the payloads."""
 
     def __init__(self, first: int, mask_bit: int) -> None:
         super().__init__()
