@@ -395,7 +395,7 @@ def cde_table(factor: npt.NDArray[np.float64], prob_bits: int) -> npt.NDArray[np
 
     A variable's codes beyond its cardinality, up to the next power of two, are unused. Between a used and an unused
     code, the odds favour the used one as far as a table can; if both are unused, or another variable is at an unused
-    code, the odds are 1. The factor is float64[cardinalities of the variables], for n bits the result is
+    code, the odds are 1. The factor is float64[cardinalities of the variables]; for n bits, the result is
     uint16[n * 2**(n - 1)].
     """
     # NaN at unused codes: what is computed with one is NaN, too

@@ -118,7 +118,7 @@ class Posteriors:
         """Wait for one posterior, `timeout` seconds at most; None for no limit.
 
         Raises:
-            NoResultError: None arrived in time.
+            NoResultError: No posterior arrived in time.
             BadResultError: A message on the topic is not a posterior; the next call continues after it.
             DisconnectedError: This object or the client is closed.
             ConcurrentReadError: Another task is waiting already.
@@ -283,7 +283,7 @@ def listen(
         The number of posteriors passed to the function.
 
     Raises:
-        NoResultError: None arrived in time.
+        NoResultError: No posterior arrived in time.
         BadResultError: A message on the topic is not a posterior.
         BridgeError: The server is not reachable, or is not a rosbridge server.
     """

@@ -1,6 +1,6 @@
 """The robot and the stack as the page sees them: topics, services, and the status sockets of this machine.
 
-It reconnects for ever, because the page may start before the robot and outlive it.
+Lost connections are retried for ever, because the page may start before the robot and outlive it.
 """
 
 import asyncio

@@ -124,7 +124,7 @@ class ArrayField:
 
 
 def array_field(definitions: Definitions, message_type: str, path: str | None) -> ArrayField:
-    """Return the array of numbers at a path in a message type, or the type's only one.
+    """Return the array of numbers at a path in a message type or, without a path, the only one in the type.
 
     Raises:
         SettingsError: There is no array of numbers at the path; or without a path, the type has none or several.

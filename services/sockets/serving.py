@@ -76,7 +76,7 @@ MakeLink = Callable[[Callable[[AnyRecord], None]], Link]
 
 
 class MasterLink(Link):
-    """Link over a local socket that listens for a master and passes its records on.
+    """A link that listens on a local socket for a master, and passes the master's records on.
 
     A second master is refused until the first has disconnected. If the deployment folder of the service has changed
     since its start and a master requires the new deployment, the service ends with an error.

@@ -211,7 +211,7 @@ class Contents:
 
 
 def contents(joint: JointDistribution, searched: Sequence[str] = (), known: Sequence[str] = ()) -> Contents:
-    """Return the variables of a network; `known` are the possible known ones; if empty, all not searched.
+    """Return the variables of a network. Those in `known` may be known; if it is empty, all that are not searched.
 
     Raises:
         ToolchainError: A variable does not exist or is named twice, or there are too many candidates.

@@ -47,7 +47,7 @@ def check_model(
 ) -> list[Finding]:
     """Return the findings about a model and its machine, the worst first.
 
-    `fit` changes the plan of a BM1 to the number of boards that it needs.
+    `fit` changes the plan of a BM1 to as many boards as its machine needs.
     """
     refused: list[Finding] = []
     try:  # apart from the plan, so that mistakes in both are found at once

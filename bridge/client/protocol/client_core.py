@@ -74,7 +74,7 @@ class ClientCore:
     def receive(self, data: bytes, now: float) -> Event | None:
         """Return the event in a WebSocket message; `now` is in monotonic seconds.
 
-        It is None for requests that were refused here, for messages of topics or calls that no longer exist,
+        The result is None for requests that were refused here, for messages of topics or calls that no longer exist,
         and for all fragments of a message but the last. Invalid data gives an `UnusableReceived`.
         """
         # The usual case: a message of a topic that had one before.
