@@ -104,7 +104,7 @@ class SlowPeerError(BridgeError):
 
 
 class ServiceError(BridgeError):
-    """Raised when a service answers `result: false`; a handler raises it to give this answer.
+    """Raised when a service answers `result: false`. A handler raises a ServiceError to give this answer.
 
     Attributes:
         reason: The unchanged text of the answer.

@@ -40,7 +40,7 @@ class Field:
         """Read a bare name or a path.
 
         Raises:
-            PathError: The text is neither.
+            PathError: The text is neither a bare name nor a path.
         """
         self.name = name
         self._is_path = "." in name or "[" in name

@@ -212,13 +212,13 @@ _PATIENCE_S: Final = 1.0
 
 
 class Listener:
-    """The frames that a running stack publishes, each with its true position; created by `listen`.
+    """The frames that a running stack publishes, each with its true position. `listen` creates a Listener.
 
-    If no true pose has exactly the frame's stamp, the newest earlier one is used if it is at most `tolerance_ns` older.
-    This is for readings without a header, which are stamped only when they reach the host.
+    A frame's true position has the frame's stamp, or is the newest earlier position, at most `tolerance_ns` older.
+    A tolerance is needed for readings without a header, because they are stamped only when they reach the host.
 
     Attributes:
-        route: The true positions received, the newest last.
+        route: The true positions received, with the newest last.
     """
 
     def __init__(self, heard: Posteriors, tolerance_ns: int) -> None:

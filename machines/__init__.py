@@ -1,9 +1,11 @@
 """Bayesian machines, emulated bit for bit, without sockets and files.
 
-Start at `machines.posterior` (one call of a BM1, for a notebook), `make_kernel` or `make_bm2_kernel` (the machine of a
-board). `machines.bm1` and `machines.bm2` define the machines. `machines.reference` and `machines.bm2_reference` run
-them cycle by cycle; `machines.fast`, `machines.bm2_fast` and `machines.bm2_chains` get the same results faster, and
-only these import numba. `machines.kind` is the interface for all other packages.
+- `machines.posterior` computes a BM1's posterior in one call, for example in a notebook.
+- `make_kernel` and `make_bm2_kernel` return the running machine of a board.
+- `machines.bm1` and `machines.bm2` define the machines.
+- `machines.reference` and `machines.bm2_reference` run a machine cycle by cycle.
+- `machines.fast`, `machines.bm2_fast` and `machines.bm2_chains` get equal results faster, with numba.
+- `machines.kind` is the interface for all other packages.
 """
 
 from collections.abc import Callable

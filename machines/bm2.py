@@ -305,10 +305,10 @@ class BM2Machine(MachineContents):
 
     Attributes:
         parameters: Variables, factors, widths and generators.
-        tables: For each CDE, whose factor has n bits, a uint16[n * 2**(n - 1)]: entry j * 2**(n - 1) + v is the
-            probability code with which bit j is drawn if the other n - 1 bits, in rising order, have the value v.
-        supports: One bool[cardinalities of the variables] per factor: True where the factor is not 0.
-        rng_table: uint32[length], the random numbers for all CDEs if `rng` is `table`; otherwise None.
+        tables: One uint16[n * 2**(n - 1)] per CDE, where n is the number of bits of the CDE's factor. Bit j is drawn
+            with the probability code in entry j * 2**(n - 1) + v. The other n - 1 bits, in rising order, form v.
+        supports: One bool[cardinalities of the variables] per factor. It is True where the factor is not 0.
+        rng_table: uint32[length], the random numbers for all CDEs if `rng` is `table`, or otherwise None.
 
     Raises:
         ParameterError: The arrays do not match the parameters.

@@ -12,10 +12,10 @@ from machines.parameters import CYCLES_MAX, BM1Parameters, PriorMode, SensorMode
 
 
 class BM1Kernel(ABC):
-    """A running machine with `replicas` replicas, which share its generators (thesis 2.1.2 and 4.4).
+    """A running machine with `replicas` replicas around one set of generators (thesis 2.1.2 and 4.4).
 
-    Each replica counts and stops by itself; the generators step until the last replica has stopped. Counts,
-    cycles, reasons and states are the same in every kernel, bit for bit.
+    Each replica counts and stops by itself. The generators step until the last replica has stopped. All kernels give
+    equal counts, cycles, stop reasons and generator states, bit for bit.
     """
 
     def __init__(self, machine: BM1Machine) -> None:

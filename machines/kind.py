@@ -33,18 +33,18 @@ class FrameInput:
     """Readings and settings of a frame, for all boards.
 
     Attributes:
-        addresses: One table address per sensor column, in the order of the model; None for a missing reading.
-            With inputs per cell or replicas: an array of integers in the `input_shape` of the whole machine,
-            addresses or codes, with -1 in all lines of a missing reading.
-        prior_address: Row of the prior's table (prior select); with replicas one row for all, or a tuple with a
-            row for each.
-        prior_codes: uint16[total lines], a written prior; with replicas the same for all, or uint16[replicas, total
-            lines]. None for the prior in the image.
+        addresses: One table address per sensor column, in the order of the model, or None for a missing reading.
+            A machine with inputs per cell or with replicas gets an array of integers instead, in the `input_shape`
+            of the whole machine. The integers are addresses or codes. A missing reading is -1 in all its lines.
+        prior_address: Row of the prior's table (prior select). With replicas, one row for all replicas, or a tuple
+            with one row per replica.
+        prior_codes: The written prior: uint16[total lines], for all replicas, or uint16[replicas, total lines].
+            None selects the prior in the image.
         target_count: Count that stops the machines (thesis figure 3.3: number of target samples).
         max_cycles: Maximum number of cycles.
         bank: Set of seeds from which the RNGs restart.
-        stop: `slices`: all boards stop at the end of the slice in which the first one overflows; `own`: each
-            board stops independently.
+        stop: With `slices`, all boards stop at the end of the slice in which the first board overflows. With `own`,
+            each board stops independently.
     """
 
     addresses: tuple[int | None, ...] | npt.NDArray[np.integer]
@@ -96,13 +96,13 @@ class Inference(NamedTuple):
 
     Attributes:
         boards: The boards' results.
-        posterior: float64[all lines], the joint posterior; None if there is none. With replicas
-            float64[replicas * all lines], one posterior after the other, with zeros for a replica without
-            one; None if no replica has one.
+        posterior: The joint posterior, float64[all lines], or None if there is none. With replicas,
+            float64[replicas * all lines]: the replicas' posteriors one after the other. A replica without a posterior
+            has zeros. The value is None only if no replica has a posterior.
         totals: The sum of the counts of each board.
-        outcome: `posterior`, or the reason why there is none, or why it is biased.
+        outcome: `posterior`, or the reason why the posterior is missing or biased.
         details: Further values for the report of the frame, by their keys.
-        samples: The sampled states of the machine, concatenated; empty if the kind or the image has no stream.
+        samples: The sampled states of the machine, concatenated. A machine without a stream has none.
         sample_bytes: Length of each sampled state in bytes.
     """
 
@@ -150,10 +150,11 @@ class UsedRegisters:
 
 
 class BoardMachine(ABC):
-    """The machine of a board, which reads its inputs from the board's registers and writes its results there.
+    """The machine of a board. It reads its inputs from the board's registers and writes its results there.
 
-    It runs only within calls: `start` and `resume` begin a slice after a doorbell, `step` continues the slice.
-    All three stop at cycle `end` at the latest (0: no such limit), with the results in `UsedRegisters.answer`.
+    The machine runs only within calls. `start` and `resume` begin a slice after a doorbell; `step` continues the slice.
+    All three methods stop at cycle `end` at the latest. An `end` of 0 sets no limit. The results are then in the blocks
+    of `UsedRegisters.answer`.
     """
 
     def __init__(self, kernel: Any, memory: Mapping[str, memoryview]) -> None:

@@ -30,7 +30,7 @@ The payload is the registers from DONE to COMPUTE_NS, then the results if CAP_LI
 ERROR: Final = 5
 """Board to host: the request of this sequence number was refused (`encode_error`)."""
 PROGRAM: Final = 6
-"""Loader to the programming port: a part of a programming file; `address` is its offset in bytes."""
+"""Loader to the programming port: a part of a programming file. `address` is the part's offset in bytes."""
 AUTHENTICATE: Final = 7
 """Board to host before GREET: a challenge. The host answers with nonce and proof, the board with its own proof."""
 

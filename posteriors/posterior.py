@@ -285,10 +285,12 @@ class Posterior:
         return as_html(self.axes, self.values, facts)
 
     def plot(self, axes: Any = None) -> Any:
-        """Draw bars for one dimension; for more, draw a map of the two longest, and sum over the others.
+        """Draw bars for one dimension, or otherwise a map of the two longest dimensions.
+
+        The map sums over the remaining dimensions.
 
         Args:
-            axes: matplotlib's Axes to draw in; without them, pyplot makes a figure, which a notebook shows.
+            axes: matplotlib's Axes to draw in. Without Axes, pyplot makes a figure, and a notebook shows the figure.
 
         Returns:
             The Axes.

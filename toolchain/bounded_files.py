@@ -34,7 +34,9 @@ def file_errors(path: Path, done: str, error: type[ToolchainError], advice: str 
 
 
 def open_regular(path: Path, error: type[ToolchainError], most: int | None = None) -> BinaryIO:
-    """Open a regular file for reading; refuse any other kind, because a FIFO or a device could block or never end.
+    """Open a regular file for reading.
+
+    Other kinds of files are refused, because a FIFO or a device could block or never end.
 
     Raises:
         error: The file is missing, cannot be read, is not a regular file, or has more than `most` bytes.

@@ -180,17 +180,18 @@ class Ros:
 
         Args:
             topic: Name of the topic.
-            type: Type of the messages; None for any. Without a type, the subscription is repeated every two
-                seconds until a message arrives, because servers drop subscriptions to unknown topics.
-            throttle_rate: Minimum number of milliseconds between two messages; the server drops those in between.
-            queue_length: Number of throttled messages that the server queues.
-            queue_size: Maximum number of messages queued here; then the oldest is dropped and counted.
-            compression: `cbor` for long arrays in a tenth of the time of JSON, `cbor-raw` for only the
-                serialised bytes (`Message.raw`). A server that does not support it sends JSON, or nothing.
-            arrays: Python type of arrays of numbers: `list`, or `numpy` for NumPy arrays, read-only from CBOR.
+            type: Type of the messages, or None for any type. Without a type, the client repeats the subscription
+                every two seconds until a message arrives, because servers drop subscriptions to unknown topics.
+            throttle_rate: Minimum number of milliseconds between two messages. The server queues or drops the rest.
+            queue_length: Maximum number of throttled messages that the server queues.
+            queue_size: Maximum number of messages queued here. A full queue drops and counts its oldest message.
+            compression: `cbor` needs a tenth of the time of JSON for long arrays. `cbor-raw` passes only the
+                serialised bytes (`Message.raw`). A server without support for the value sends JSON, or nothing.
+            arrays: Python type of arrays of numbers: `list`, or `numpy` for NumPy arrays. CBOR gives read-only
+                NumPy arrays.
             fragment_size: Maximum number of characters that the server sends in one fragment.
-            qos: Quality of service in ROS 2; older servers ignore it.
-            max_bytes: Maximum size of a message in bytes; a larger one is discarded and counted
+            qos: Quality of service in ROS 2. Older servers ignore this option.
+            max_bytes: Maximum size of a message in bytes. A larger message is discarded and counted
                 (`Subscription.discarded`).
 
         Raises:
@@ -345,7 +346,10 @@ class Ros:
 
     @property
     def ros_version(self) -> RosVersion | None:
-        """ROS version of the server: configured, detected, or seen in header stamps; None if unknown."""
+        """ROS version of the server, or None if it is unknown.
+
+        The version was configured, detected, or seen in the stamps of message headers.
+        """
         return self._session.core.ros_version
 
     async def detect_ros_version(self, timeout: float = DETECT_TIMEOUT) -> RosVersion | None:

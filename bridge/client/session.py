@@ -52,7 +52,7 @@ STEADY: Final = 5.0
 SILENCE: Final = 2.0
 """Seconds after which a subscription that has had no message is checked."""
 LONGEST_SILENCE: Final = 30.0
-"""Maximum delay in seconds between two checks of silent subscriptions; the delay doubles up to it."""
+"""Maximum delay in seconds between two checks of silent subscriptions. The delay begins at `SILENCE` and doubles."""
 _ROSAPI_TIMEOUT: Final = 1.0
 KEPT_STATUSES: Final = 16
 """Number of status messages of the server that are stored."""
@@ -552,7 +552,7 @@ class Session:
         return answer.values
 
     def context_since(self, since: float) -> str:
-        """Return a clause about events after `since`: a lost connection, or a status message; empty if none."""
+        """Return a clause about a lost connection or a status message after `since`, or "" if there was neither."""
         if self._lost_at > since:
             return f"; meanwhile the connection was lost: {self.last_error}"
         return f"; the server reported: {self.statuses[-1].text[:200]}" if self._status_at > since else ""

@@ -65,7 +65,7 @@ class TypeChecks:
         """Check a request for a service; each question to rosapi about its type takes at most `limit` seconds.
 
         Raises:
-            MessageTypeError: It has a field that the type does not have, or an array of another shape.
+            MessageTypeError: The request has a field that the type does not have, or an array of another shape.
         """
         # Requests to rosapi itself are made by this client, and asking about them would never end.
         name = absolute(service)
@@ -83,7 +83,7 @@ class TypeChecks:
         _apply(check, args, f"a call of {service}")
 
     async def check_goal(self, action: str, type_name: str, goal: Mapping[str, Any], limit: float) -> None:
-        """Check a goal of an action of ROS 2; limit and errors as for `check_request`."""
+        """Check a goal of an action of ROS 2. `limit` and the errors are as in `check_request`."""
         if self._may_ask():
             check = await self.part("action_goal", ros2_type(type_name, "action"), limit)
             _apply(check, goal, f"a goal of {action}")

@@ -60,10 +60,9 @@ _log = _NoDebug(logging.getLogger("bridge.client.websocket"), {})
 
 
 def check_uri(uri: str) -> WebSocketURI:
-    """Read the URI of a rosbridge server.
+    """Read the URI of a rosbridge server, or raise a UriError.
 
-    Raises:
-        UriError: it is not `ws://host:port` or `wss://host:port` (a path and credentials may follow).
+    The form is `ws://host:port` or `wss://host:port`. The URI may also contain a path and credentials.
     """
     try:
         parsed = parse_uri(uri)

@@ -57,17 +57,17 @@ def decode(
     Args:
         data: A whole WebSocket message.
         max_size: Maximum number of bytes.
-        max_depth: Maximum nesting of maps, arrays and tags, including the outermost (an empty map or array at
-            the innermost level does not count).
-        arrays: Form of typed arrays and byte strings: `list` makes lists of numbers, and bytes of `uint8[]`;
-            `numpy` makes read-only one-dimensional arrays that share the message's memory.
+        max_depth: Maximum nesting of maps, arrays and tags. The outermost level counts. An empty map or array at
+            the innermost level does not count.
+        arrays: Form of typed arrays and byte strings. `list` makes lists of numbers, and `bytes` of `uint8[]`.
+            `numpy` makes read-only one-dimensional arrays.
 
     Returns:
-        The map. Its numbers may be NaN or infinite.
+        The map of the message, whose numbers may be NaN or infinite.
 
     Raises:
-        DecodeError: The data is too large, too deep, not a CBOR map, or contains values that ROS messages
-            cannot contain.
+        DecodeError: The data is too large, is nested too deeply, or is not a CBOR map. The error is also raised
+            if the map contains values that ROS messages cannot contain.
     """
     if len(data) > max_size:
         raise DecodeError(f"a message of {len(data)} bytes arrived, expected at most {max_size}")

@@ -120,7 +120,7 @@ class MessageCheck:
         """Check a message.
 
         Raises:
-            MessageTypeError: It has a field that the type does not have, or an array of another shape.
+            MessageTypeError: The message has a field that the type does not have, or an array of another shape.
         """
         self._check(self._type, msg, "")
 
@@ -170,7 +170,10 @@ class MessageCheck:
 
 
 def check_from_rosapi(answer: Any) -> MessageCheck | None:
-    """Return the check of the first type in rosapi's answer (the others are nested in it); None if it is unreadable."""
+    """Return the check of the first type in rosapi's answer, or None if the answer is unreadable.
+
+    The other types in the answer are the types of nested messages.
+    """
     definitions = definitions_from_rosapi(answer)
     match answer:
         case {"typedefs": [{"type": str(name)}, *_]} if (key := _key(name)) in definitions:

@@ -58,7 +58,7 @@ class AccessPolicy:
 
     @property
     def allowed_origins(self) -> list[Origin | re.Pattern[str] | None]:
-        """Return the origins that the handshake accepts; None stands for programs, which do not send one."""
+        """Return the origins that the handshake accepts. None admits programs, because only browsers send an origin."""
         return [None, LOCAL_ORIGIN, *map(Origin, self.origins)]
 
     def refusal(self, request: Request, *, loopback: bool) -> HTTPStatus | None:

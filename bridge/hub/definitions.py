@@ -102,7 +102,7 @@ class MessageDefinitions:
         return {field: element_of(kind, content) for field, (kind, content) in fields_of(store, known)}
 
     def defaults(self, name: str) -> dict[str, Any]:
-        """Return the defaults of a known message type's fields; the caller must not change them."""
+        """Return the defaults of a known message type's fields. The caller must not change the dictionary."""
         if name not in self._defaults:
             self._defaults[name] = {
                 field: self._default(name, field, element, length)
@@ -232,7 +232,10 @@ def _store(name: "Stores") -> "Typestore":
 
 
 def _define(store: "Typestore", name: str, ros_version: RosVersion) -> bool:
-    """Return whether a type is known; if rosbags lacks it, first add the definition in `message_texts`, if any."""
+    """Return whether the store has a type, or now has it from `message_texts`.
+
+    If rosbags lacks the type, its definition in `message_texts`, if any, is added to the store.
+    """
     if name in store.fielddefs:
         return True
     text = message_texts(ros_version).get(name)

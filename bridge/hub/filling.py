@@ -64,17 +64,18 @@ class Filler:
         return dict(zip(self._defaults, values, strict=False))
 
     def fill(self, message: dict[str, Any], room: int, *, keep: bool = True) -> bytes | None:
-        """Fill the absent fields of a message; values of a wrong type stay as they are.
+        """Fill the absent fields of a message. Values of a wrong type stay as they are.
 
         Args:
             message: The message.
-            room: Number of bytes by which its nested messages may grow.
-            keep: Whether `message` is used afterwards. If not, its outermost fields are filled only if it must be
-                written again, because filling them takes as long as a tenth of all other work for a small message.
+            room: Number of bytes by which the nested messages may grow.
+            keep: Whether the caller uses `message` afterwards. If not, the outermost fields are filled only if a nested
+                message has grown. Filling them takes a tenth of the time of all other work for a small message.
 
         Returns:
-            The bytes that replace the last two braces of a JSON operation whose last value is the message, so that it
-            need not be written again; empty if no field was absent, None if a nested message has grown.
+            The bytes that replace the last two braces of a JSON operation whose last value is the message, or None if
+            a nested message has grown. The bytes save the caller from encoding the operation again. They are empty if
+            no field was absent.
 
         Raises:
             RefusedOperationError: The nested messages would grow by more than `room`.

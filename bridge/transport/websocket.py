@@ -7,10 +7,10 @@
     socket ◀── write ◀─┬─ send: frames of whole messages
                        └─ _flush: what the library answers
 
-The sans-I/O protocol of `websockets` handles handshakes, control frames, fragments and malformed frames.
-Nearly all rosbridge messages are unfragmented; the functions of `bridge.transport.frames` read and write them
-in a fraction of the time. The library gets only whole frames, so it is always between two of them. After a
-malformed frame or the beginning of the closing handshake, it reads everything.
+The library is the sans-I/O protocol of `websockets`. It handles handshakes, control frames, fragments and malformed
+frames. Nearly all rosbridge messages are unfragmented. The functions of `bridge.transport.frames` read and write
+unfragmented messages in a fraction of the library's time. The library gets only whole frames, so it never waits for
+the rest of a frame. After a malformed frame or the beginning of the closing handshake, the library reads everything.
 """
 
 import asyncio

@@ -114,7 +114,8 @@ class ImagePairs:
     """The images of two cameras, paired by equal stamps.
 
     Attributes:
-        unpaired: The number of images of the left and of the right camera since the last pair; 0 for a silent camera.
+        unpaired: Number of images of the left camera, and of the right camera, since the last pair. A silent camera
+            has 0.
     """
 
     def __init__(self) -> None:

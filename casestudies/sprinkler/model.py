@@ -1,6 +1,6 @@
-"""The sprinkler's network P(R) P(S | R) P(G | S, R), its question P(R | G), and its topics (thesis 2.1.3.1).
+"""The sprinkler case study: the network P(R) P(S | R) P(G | S, R), the question P(R | G) and a topic (thesis 2.1.3.1).
 
-R: whether it has rained; S: whether the sprinkler was on; G: whether the grass is wet.
+R is 1 if it has rained, S is 1 if the sprinkler was on, and G is 1 if the grass is wet.
 """
 
 from functools import cache

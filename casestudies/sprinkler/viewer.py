@@ -53,7 +53,7 @@ class FrameSummary:
     effective: float
     """Number of effective samples, from `/bm/frame`; 1 if that does not state it."""
     curve: NDArray[np.int64]
-    """int64[points, 2]: n, and how many of the first n samples have R = 1; in the last row, n counts all samples."""
+    """int64[points, 2]: a number n, and how many of the first n samples have R = 1. The last n counts all samples."""
 
 
 def frame_of(posterior: Posterior, samples: NDArray[np.int64]) -> FrameSummary:

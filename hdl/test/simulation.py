@@ -47,8 +47,8 @@ def prepare(image: Image, folder: Path, hdl: Path = HDL, more_sources: Sequence[
     Args:
         image: Image of the board.
         folder: Folder of the simulation.
-        hdl: Folder of the VHDL: `HDL`, or a changed copy (a mutant).
-        more_sources: Further VHDL files, relative to `hdl`, which are analysed last.
+        hdl: Folder of the VHDL. A changed copy of `HDL` is a mutant.
+        more_sources: Further VHDL files to analyse last, relative to `hdl`.
 
     Raises:
         HardwareToolError: GHDL is not installed or refused a file.

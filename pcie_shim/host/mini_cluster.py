@@ -47,13 +47,13 @@ class FrameOutput:
     Attributes:
         boards: One result per board, in the order of the partition.
         register_writes_ns: Time for posting settings, sensors, starts and resumes.
-        compute_ns: Time spent waiting for the boards: their computing time, and the transport.
-        reads_ns: Time for reading the results, or for copying those that came with the interrupts.
-        boards_compute_ns: Computing time of the slowest board, summed over the slices. The rest of
-            `compute_ns` is transport, or waiting for other boards on the same core.
+        compute_ns: Time spent waiting for the boards, for computing and for transport.
+        reads_ns: Time for reading the results, or for copying results that came with the interrupts.
+        boards_compute_ns: Computing time of the slowest board, summed over the slices. `compute_ns` is longer by the
+            transport. If several emulated boards share a core, it also contains the time of the other boards.
         slices: Number of slices.
         link_bytes: Bytes between the host and all boards, in both directions, with the headers of the link.
-        link_transfers: Number of transfers of these bytes.
+        link_transfers: Number of transfers between the host and all boards.
     """
 
     boards: tuple[BoardResult, ...]
@@ -173,12 +173,12 @@ class MiniCluster:
     def run(self, frame: FrameInput) -> FrameOutput:
         """Compute one frame on all boards.
 
-        After an error the frame is lost. Unless the failed board only refused an access, it must be reopened
-        (`reopen`); the other boards are usable at once.
+        After an error, the frame is lost. If a board only refused an access, all boards are usable at once. Otherwise,
+        the failed board must be reopened with `reopen`, and only the other boards are usable at once.
 
         Raises:
-            FrameInputError: The frame does not fit the machine; no board was accessed.
-            BoardError: A board failed; `error.board` is its number.
+            FrameInputError: The frame does not fit the machine. No board was accessed.
+            BoardError: The board with the number `error.board` failed.
         """
         self.post(frame)
         while (output := self.collect(LONGEST_POLL_S)) is None:

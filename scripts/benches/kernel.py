@@ -1,7 +1,10 @@
-"""Speed of the fast kernels on one core: a BM1, and a BM2 with one or many chains against other Gibbs samplers.
+"""Speed of the fast kernels on one core: a BM1 alone, and a BM2 in comparison with other Gibbs samplers.
 
-sprinkler (the case study), wet grass ──┬──▶ BM2: one chain, many chains; a plain Gibbs sampler in numba
-alarm (pgmpy's), nothing known ─────────┴──▶ pyAgrum's Gibbs sampler; THRML's, with --thrml
+sprinkler (the case study), wet grass ──┬──▶ BM2 with one chain
+alarm (of pgmpy), nothing known ────────┼──▶ BM2 with many chains
+                                        ├──▶ plain Gibbs sampler in numba
+                                        ├──▶ Gibbs sampler of pyAgrum
+                                        └──▶ Gibbs sampler of THRML (only with --thrml)
 """
 
 import argparse

@@ -1,7 +1,8 @@
-"""The hub with hundreds of clients, some of which read slowly or attack it, and `master --loop` at full rate.
+"""The hub with hundreds of clients, and `master --loop` at full rate.
 
-Every message to the hub's clients contains its time of sending, so that subscribers in this process can compute its
-delay. The clients are bare sockets, which share the machine with the hub, so the figures include both.
+Some clients read slowly or attack the hub. Every message contains the time when it was sent, so subscribers in this
+process can compute its delay. The clients are bare sockets on the machine of the hub, so the delays include the CPU
+time of the clients and of the hub.
 """
 
 import argparse

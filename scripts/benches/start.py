@@ -1,4 +1,4 @@
-"""Start times: when each step of the demo and of `master --once` is over, in seconds after the command was typed.
+"""Start times of the demo and of `master --once`: seconds from the command to the end of each step.
 
 demo      hub, viewer ─┬─▶ deployment ─▶ master ─▶ first posterior ─▶ pictures
                        └─▶ simulator

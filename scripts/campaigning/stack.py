@@ -82,7 +82,7 @@ class Stack:
     Attributes:
         environment: Variables of all processes.
         hub_port: Port of the hub itself, for the campaign's own client.
-        links: Proxies by name: `rosbridge`, and each service and board if the campaign starts them.
+        links: Proxies by name: `rosbridge`, and the services and boards that the campaign starts.
     """
 
     def __init__(self, folder: Path, topology: Topology, deployment: Path, rng: random.Random) -> None:

@@ -1,7 +1,10 @@
 """Verification of the client and of deployments on a real ROS 2 rosbridge server and on the hub (see scripts/verify).
 
-this project's client ──▶ server ──▶ this project's client: every operation, and how the server treats it
-plain client (websockets and json) ──▶ server ──▶ master ──▶ server ──▶ plain client: a deployment's results
+Checks of every operation, and of the server's treatment of each operation:
+    this project's client ──▶ server ──▶ this project's client
+
+Checks of a deployment's results, with a plain client (websockets and json):
+    plain client ──▶ server ──▶ master ──▶ server ──▶ plain client
 """
 
 import asyncio

@@ -45,8 +45,9 @@ class ResultTopics:
 
     Attributes:
         rosbridges: The connections by URI.
-        advertised: The output topics, once they are advertised; `reports` is the topic of the frame reports.
-        standard: The topics for robot tools, which are published after results.
+        advertised: The output topics, once they are advertised.
+        reports: The topic of the frame reports, or None before it is advertised.
+        standard: The topics for robot tools. They are published after the results.
     """
 
     def __init__(self, settings: Settings, deployment: Deployment) -> None:

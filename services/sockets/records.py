@@ -12,12 +12,12 @@
         │                     │ ◀────────────── Published ──────────────── │
         │                     │ ◀───────────────── Seen ────────────────── │
 
-Any service may send `Notice` at any time, and `Trouble` before it ends. `Unusable` replaces a reading, and
-`FrameFailed` a result.
+Any service may send `Notice` at any time, and `Trouble` before it ends. `Unusable` replaces a `Reading`, and
+`FrameFailed` replaces a `FrameResult`.
 
-Every record is a MessagePack array whose first element is its tag. `stamp_ns` and `received_ns` are
-Unix times; other fields `*_ns` are durations; fields `*_tick` and `ticks` are times of this computer's monotonic
-clock, comparable between its processes.
+Every record is a MessagePack array. The first element of the array is the record's tag. The fields `stamp_ns` and
+`received_ns` are Unix times. The other fields `*_ns` are durations. The fields `*_tick` and `ticks` are times of this
+computer's monotonic clock, so all processes on the computer can compare them.
 """
 
 from enum import StrEnum
@@ -140,11 +140,12 @@ reading, and for an array.
 
 
 class Reading(Record, tag="reading", frozen=True):
-    """Subscriber to master: one complete set of addresses, with the newest stamp of its messages (or time of receipt).
+    """Subscriber to master: one complete set of addresses.
 
-    `prior_codes` is the prior from a message, two bytes per cell (and replica); empty for the prior in the machine.
-    `passed_over` is the number of readings that the subscriber dropped since the last one it sent; `unpaired` is the
-    number of unpaired messages.
+    `stamp_ns` is the newest stamp of the messages in the set, or the time of receipt if they have no stamps.
+    `prior_codes` is the prior from a message, with two bytes per cell of each replica. An empty `prior_codes` selects
+    the prior in the machine. `passed_over` is the number of readings that the subscriber has dropped since its last
+    `Reading`. `unpaired` is the number of messages that have remained unpaired since that `Reading`.
     """
 
     # When it was read on the robot, when its last message arrived here, and when this record was sent.

@@ -66,14 +66,14 @@ _LOST: Final = (1.0, math.nan, 0.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Difference:
-    """Distances between two posteriors of a frame, ours and theirs, averaged over frames.
+    """Distances between the two posteriors of a frame, `ours` and `theirs`, averaged over frames.
 
     Attributes:
-        total_variation: Half the sum of absolute differences, 0 to 1; 1 for a frame without a posterior.
-        map_agreement: Share of all frames in which both posteriors exist, with the same most probable line.
-        kl_bits: KL(ours || theirs) in bits; None if the mean includes frames without a posterior. (KL(theirs || ours)
-            would be infinite if a count is 0.)
-        alone: The same distances over only the frames with a posterior; None if there are no such frames.
+        total_variation: Half the sum of absolute differences, from 0 to 1. A frame without a posterior counts as 1.
+        map_agreement: Share of all frames in which both posteriors exist and have an equal most probable line.
+        kl_bits: KL(ours || theirs) in bits, or None outside of `alone`, because frames without a posterior have no
+            KL. The opposite direction, KL(theirs || ours), would be infinite if a count is 0.
+        alone: The distances averaged over only the frames with a posterior, or None if no frame has a posterior.
     """
 
     total_variation: Interval

@@ -136,7 +136,7 @@ class ExactChain:
 
     @cached_property
     def _searched(self) -> NDArray[np.int64]:
-        """int64[states]: the index of the searched variables' joint value; -1 if any variable has an unused code."""
+        """int64[states]: the index of the searched variables' joint value, or -1 if any variable has an unused code."""
         bits = np.stack([self._values[bit] for bit in range(self._parameters.state_bits)], axis=1)
         packed = np.packbits(bits.astype(np.uint8), axis=1, bitorder="little")
         words = np.pad(packed, ((0, 0), (0, -packed.shape[1] % 4))).view("<u4")

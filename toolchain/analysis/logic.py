@@ -74,8 +74,10 @@ class Of(StrEnum):
     BOARD = "board"
     """The units that each board has once: bm1_axi, bm_register_block, bm1_guard, and bm1_control of a single machine."""
     CODE_BIT = "code bit"
-    """A bit of a cell's code, in bm1_stochastic_bitstream_generator: its part of the comparison of the random number
-    with the code, of the tests for all ones and all zeros, and of the AND of bm1_tile_element."""
+    """A bit of a cell's code, in bm1_stochastic_bitstream_generator.
+
+    The logic of the bit compares the random number with the code, and tests the code for all ones and all zeros. It
+    also has a part of the AND of bm1_tile_element."""
     COUNTER_BIT = "counter bit"
     """A bit of a counter, in bm1_counter, bm1_readout and bm1_matrix: its increment, its comparison with the target,
     and its selection for the host."""

@@ -127,10 +127,11 @@ def plan_machine(model: Model, options: BuildOptions) -> MachinePlan:
 
 
 def _filter_options(options: BuildOptions) -> BuildOptions:
-    """Return the options for the machine of a filter, which needs a written prior, or raise a BuildError.
+    """Return the options for the machine of a filter, or raise a BuildError.
 
-    By default, codes have 16 bits: with 8 bits, the smallest code of a prediction stands for too large a probability,
-    and the error of the posteriors triples on 400 lines.
+    The machine of a filter needs a written prior. By default, its codes have 16 bits. With 8 bits, even the smallest
+    code is too large for the small probabilities in a prediction. The error of the posteriors then triples on 400
+    lines.
     """
     if options.written_prior is not None:
         flag = "--prior-path" if options.sources is None else f"the prior in {options.sources.toml.path}"

@@ -401,10 +401,10 @@ MachineSection: TypeAlias = Annotated[
 
 
 class WrittenPrior(Section):
-    """`[prior]`: the topic of a written prior, with one number per line; only the ratios of the numbers matter.
+    """`[prior]`: the topic of a written prior, with one number per line. Only the ratios of the numbers matter.
 
-    Without this section, a machine with `prior_mode = written` uses the prior of its images until a host
-    writes another.
+    Without this section, a machine with `prior_mode = written` uses the prior of its images until a host writes a
+    prior.
     """
 
     source: int = Field(default=0, ge=0)

@@ -40,7 +40,7 @@ class Recording:
     columns: dict[str, list[object]]
     """The values in each column, by its name, one per row: a number, a text, or None if missing."""
     stamps: tuple[int, ...] = ()
-    """The time of each row in nanoseconds: of a bag, or of a CSV file read with `stamped`; otherwise empty."""
+    """The time of each row in nanoseconds. A CSV file has times only if it has a time column and `stamped` is set."""
 
 
 def read_recording(
@@ -48,12 +48,13 @@ def read_recording(
 ) -> Recording:
     """Return the named columns of a recording: a CSV file (`.csv`), an MCAP file, a ROS 1 bag or a ROS 2 bag's folder.
 
-    In a bag, each message on the topic of the first column is a row; other topics' stamps may differ by `tolerance_s`.
-    With `stamped`, the stamps of a CSV file are those of its column `stamp_ns` or `time_s`.
+    In a bag, each message on the topic of the first column is a row. The stamps of the other topics may differ from
+    the row's stamp by `tolerance_s`. With `stamped`, the stamps of a CSV file come from its column `stamp_ns` or
+    `time_s`.
 
     Raises:
-        ModelError: The recording is missing, damaged, lacks a column (the sentence lists its columns), or has
-            more than `MAX_ROWS` rows.
+        ModelError: The recording is missing or damaged, lacks a column, or has more than `MAX_ROWS` rows. If a
+            column is missing, the message lists the existing columns.
     """
     if not path.exists():
         raise ModelError(f"the recording {path} does not exist")

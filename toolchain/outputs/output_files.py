@@ -95,7 +95,7 @@ class Change(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class OutputFiles:
-    """A part of a deployment, such as its MIFs: the files, and a pattern for those of earlier builds."""
+    """The files of a part of a deployment, for example of its MIFs, and a pattern for files of earlier builds."""
 
     contents: dict[str, Iterable[bytes]]
     """For each path in the deployment's folder, the pieces of the file's content, which can be consumed once."""

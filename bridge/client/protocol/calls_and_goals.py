@@ -292,7 +292,7 @@ class ServedActions(_Served):
     def receive(
         self, operation: dict[str, Any], data: bytes
     ) -> GoalRequested | CancelRequested | UnusableReceived | None:
-        """Handle a goal or its cancellation; return None if the goal was refused here, or has ended."""
+        """Handle a goal or a cancellation. Return None if the goal was refused here or has ended."""
         goal, action, args = operation.get("id"), operation.get("action"), operation.get("args")
         if not isinstance(goal, str) or not isinstance(action, str):
             return UnusableReceived(f"a goal without an action or an id arrived: {excerpt(data)}")

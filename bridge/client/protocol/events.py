@@ -12,9 +12,9 @@ class Message(NamedTuple):
 
     Attributes:
         topic: Name of the topic in the server's spelling.
-        msg: The ROS message; shared by all subscriptions of the topic, so do not modify it.
-        received_ns: `time.time_ns()` at its arrival, the same for all messages that arrive together.
-        received_monotonic_ns: `time.monotonic_ns()` at the same time.
+        msg: The ROS message. Do not modify it, because all subscriptions of the topic share it.
+        received_ns: `time.time_ns()` at arrival. Messages that arrive together have equal times.
+        received_monotonic_ns: `time.monotonic_ns()` at arrival.
     """
 
     topic: str

@@ -118,7 +118,10 @@ class Stack:
         return {each["name"]: each for each in self.status().get("processes", [])}
 
     def up(self, services: tuple[str, ...] = SERVICES) -> None:
-        """Start the project; raise a CheckError unless the expected services, and no others, become healthy."""
+        """Start the project and wait until its services are healthy.
+
+        Raises a CheckError if a service does not become healthy, or if the running services are not `services`.
+        """
         wait = ("--wait", "--wait-timeout", str(int(UP_LIMIT)))
         try:
             self.compose("up", "--detach", *wait, limit=UP_LIMIT + COMMAND_LIMIT)
