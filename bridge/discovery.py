@@ -62,7 +62,7 @@ class Robot:
     Attributes:
         name: Name of the robot.
         uri: URI of the server.
-        ros_version: Its ROS version, None if it is not announced.
+        ros_version: ROS version of the server, or None if the server does not announce a version.
         token: Whether clients need a token.
     """
 

@@ -1,9 +1,9 @@
 """Errors of rosbridge connections, each with one sentence for the user.
 
-`str(error)` states what happened, where, what was expected and, if it helps, what to do. `exit_code` is the
-exit code of a command that ends with the error; other subclasses inherit the code of their base class.
+`str(error)` states what happened, where it happened, and what was expected. Some errors add advice. If an error
+ends a command, the command exits with the error's `exit_code`. Other subclasses inherit the code of their base:
 
-* `BridgeError`: 3, caused by the server, or by what it sent
+* `BridgeError`: 3, caused by the server or by its messages
     * `UsageError`: 2, caused by usage, configuration or credentials
     * `FieldMissingError`, `FieldAmbiguousError`: 4, a variable was not found in a message
 """

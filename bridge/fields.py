@@ -31,7 +31,7 @@ class Field:
 
     Attributes:
         name: The configured bare name or path.
-        place: Place of the variable; None for a bare name until it is found in a message.
+        place: Place of the variable. For a bare name, it is None until a message contains the name.
     """
 
     __slots__ = ("_is_path", "name", "place")

@@ -46,7 +46,10 @@ def ros2_type(name: str, kind: Kind = "msg") -> str:
 
 
 def same_type(one: str, other: str) -> bool:
-    """Return whether two names, each in either form, denote the same type; malformed names only if they are equal."""
+    """Return whether two type names denote the same type. Each name may have the form of ROS 1 or ROS 2.
+
+    A malformed name denotes the same type only as an equal name.
+    """
     if one == other:
         return True
     try:

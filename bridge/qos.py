@@ -23,12 +23,12 @@ class Qos:
     """Quality of service of a topic between ROS nodes.
 
     Attributes:
-        history: Whether all messages are queued for a slow reader, or the last `depth` ones.
+        history: Messages that are queued for a slow reader: all (`keep_all`), or the last `depth` (`keep_last`).
         depth: Number of queued messages.
         reliability: Whether lost messages are sent again.
         durability: Whether a late subscriber gets earlier messages (`transient_local`).
-        deadline: Maximum expected time between messages in seconds; infinity for none.
-        lifespan: Seconds after which a message expires; infinity for never.
+        deadline: Maximum expected time between messages in seconds. Infinity means no deadline.
+        lifespan: Seconds after which a message expires. Infinity means never.
     """
 
     history: Literal["keep_last", "keep_all"] | None = None

@@ -134,20 +134,21 @@ class Ros:
     ) -> Publication:
         """Advertise a topic.
 
-        If the type is known to rosapi, or to rosbags for a known ROS version, the topic's messages are
-        checked before they are sent (`connect(..., check_types=True)`). This asks the server once for each type.
+        With `connect(..., check_types=True)`, the client checks the first message of each publication before
+        it sends the message. The client asks rosapi once for the definition of each type. If rosapi does not
+        know the type but the ROS version is known, the definition comes from rosbags.
 
-        A ROS server must first announce the topic to its network: subscribers there may miss messages in the
-        first tenths of a second.
+        A ROS server must first announce the topic to the ROS network. ROS subscribers may therefore miss
+        messages of the first tenths of a second.
 
         Args:
             topic: Name of the topic.
             type: Type in the form of ROS 1 or ROS 2.
-            latch: Whether the server stores the last message for later subscribers; it is sent again after a
-                reconnection.
-            queue_size: Maximum number of messages that wait for a slow server; also the queue size that the
-                server is to use in ROS.
-            qos: Quality of service in ROS 2; older servers ignore it.
+            latch: Whether the server stores the last message for later subscribers. After a reconnection, the
+                client sends the last message again.
+            queue_size: Maximum number of messages that wait for a slow server. The server is asked to use this
+                queue size in ROS too.
+            qos: Quality of service in ROS 2. Older servers ignore this option.
 
         Raises:
             NameFormError: The name or the type is malformed.
@@ -221,8 +222,9 @@ class Ros:
     async def call(self, service: str, args: Mapping[str, Any] | None = None, timeout: float = 5.0) -> Any:
         """Call a service.
 
-        If the service's type is known to rosapi, the request is checked before it is sent. Before the first
-        call of a service, the client asks for its type, which may take up to two seconds more.
+        Before the first call of a service, the client asks rosapi for the type of the service. This may take
+        two seconds in addition to `timeout`. If rosapi knows the type, the client checks each request before
+        it sends the request.
 
         Args:
             service: Name of the service.
@@ -236,8 +238,8 @@ class Ros:
             ServiceError: The service refused the call; the error has the server's text.
             NoAnswerError: The service did not answer in time.
             SlowPeerError: The server did not accept the call in time.
-            DisconnectedError: There is no connection, or it was lost meanwhile.
-            MessageTypeError: The request has a field that its type does not have, or an array of another shape.
+            DisconnectedError: There is no connection, or the connection was lost during the call.
+            MessageTypeError: The request has a field that the type does not have, or an array of another shape.
             EncodeError: The arguments cannot be sent as JSON.
         """
         if self._types is not None:
@@ -283,21 +285,21 @@ class Ros:
 
         Args:
             action: Name of the action.
-            type: Its type, such as `example_interfaces/action/Fibonacci` or `example_interfaces/Fibonacci`.
+            type: Type of the action, `example_interfaces/action/Fibonacci` or `example_interfaces/Fibonacci`.
             goal: Fields of the goal.
             feedback: Whether to receive feedback.
-            timeout: Maximum time in seconds until the server has accepted the message.
+            timeout: Maximum time in seconds until the server has accepted the goal's message.
 
         Returns:
-            The active goal: `async for feedback in goal`, `await goal.result(timeout)`, and `async with goal`, which
-            cancels it at the end of the block.
+            The active goal. `async for feedback in goal` yields its feedback, and `await goal.result(timeout)`
+            waits for its result. `async with goal` cancels the goal at the end of the block.
 
         Raises:
             NameFormError: The name or the type is malformed.
-            ActionlibError: The server is one of ROS 1, whose actions are topics.
-            SlowPeerError: The server did not accept it in time, or too many goals are active.
+            ActionlibError: The server uses ROS 1, where actions are sets of topics.
+            SlowPeerError: The server did not accept the message in time, or too many goals are active.
             DisconnectedError: There is no connection.
-            MessageTypeError: The goal has a field that its type does not have, or an array of another shape.
+            MessageTypeError: The goal has a field that the type does not have, or an array of another shape.
             EncodeError: The goal cannot be sent as JSON.
         """
         # In order after earlier messages, because the call may depend on them.
@@ -405,7 +407,7 @@ class Ros:
         return found if isinstance(found, str) else None
 
     async def _ask_names(self, limit: float, question: str, **args: str) -> list[str] | None:
-        """Call the rosapi service `question`, and return the names in its answer; None without an answer."""
+        """Return the names in the answer of the rosapi service `question`, or None if there is no answer."""
         names = (await self._session.ask_rosapi(question, args, limit)).get(question)
         return [name for name in names if isinstance(name, str)] if isinstance(names, list) else None
 

@@ -521,7 +521,10 @@ class Session:
             self.flush()
 
     async def ask_rosapi(self, name: str, args: Mapping[str, Any], limit: float) -> dict[str, Any]:
-        """Call a rosapi service; return an empty answer if it fails, since many servers lack rosapi."""
+        """Return the answer of a rosapi service, or an empty answer if the call fails.
+
+        A failed call is no error, because many servers lack rosapi.
+        """
         try:
             answer = await self.call(f"/rosapi/{name}", args, limit)
         except BridgeError:

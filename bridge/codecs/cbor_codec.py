@@ -178,7 +178,10 @@ def _packed(value: Any) -> Any:
 
 
 def typed_array(numbers: Sequence[Any], elements: str) -> cbor2.CBORTag:
-    """Return a typed array for a message, or raise an EncodeError; `elements` is a NumPy type such as `u1` or `f8`."""
+    """Return numbers as a typed array for a message; `elements` is the NumPy type, for example `u1` or `f8`.
+
+    Raises an EncodeError if a number does not fit the type.
+    """
     tag = _TAGS[elements]
     try:
         packed = struct.pack(f"<{len(numbers)}{TYPED_ARRAYS[tag][1]}", *numbers)

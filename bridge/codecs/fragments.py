@@ -3,11 +3,16 @@ r"""Fragments of large messages: splitting and reassembly.
     {"op":"fragment","id":"7","data":"{\"op\":\"publ","num":0,"total":2}
     {"op":"fragment","id":"7","data":"ish\",...}","num":1,"total":2}
 
-The `data` of a message's fragments, concatenated in the order of `num`, is its JSON. Servers differ
-(`docs/reference/rosbridge-differences.md`): `num` counts from 0 or from 1, `total` may be a float with a
-fraction, either may be a string, ids are strings or integers and are reused. All of this is accepted.
-Fragments that cannot form a message are refused, and incomplete messages are bounded in number, bytes and
-time.
+A message's JSON is the `data` of its fragments, concatenated in the order of `num`. This module accepts the
+different forms that servers send (`docs/reference/rosbridge-differences.md`):
+
+- `num` counts from 0 or from 1.
+- `total` is an integer, or a float that may have a fraction.
+- `num` and `total` may be strings.
+- An id is a string or an integer. Servers reuse ids.
+
+Fragments that cannot form a message are refused. Limits bound the number of incomplete messages, their bytes
+and their age.
 """
 
 import math

@@ -295,7 +295,10 @@ def topic_of(envelope: bytes) -> str | None:
 
 
 def topic_in(beginning: bytes) -> str | None:
-    """Return the topic of a publish operation from its first bytes, in JSON or CBOR; None if they do not contain it."""
+    """Return the topic of a publish operation from the operation's first bytes, which are JSON or CBOR.
+
+    Return None if the first bytes do not contain the topic.
+    """
     match = _JSON_TOPIC.search(beginning.split(b'"msg"', 1)[0])
     if match is not None:
         return match[1].replace(b"\\/", b"/").decode(errors="replace")

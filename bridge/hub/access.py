@@ -37,10 +37,11 @@ class AccessPolicy:
     """The credentials that the hub expects from clients, and the certificate that it presents.
 
     Attributes:
-        tokens: A client must present one of them; without tokens every client may connect.
-        origins: Web pages (`https://robot.example`) that may connect, in addition to those of this machine; `null` stands for
-            pages opened from a file. Programs other than browsers send no origin and may always connect.
-        tls: The hub's certificate and key; without it nothing is encrypted.
+        tokens: The accepted tokens. A client must present one token. If there are no tokens, every client may connect.
+        origins: Origins of the web pages that may connect, for example `https://robot.example`. `null` stands for pages
+            opened from a file. Pages of this machine may always connect. So may programs that are not browsers,
+            because they send no origin.
+        tls: The hub's certificate and key. If it is None, connections are not encrypted.
     """
 
     tokens: tuple[str, ...] = field(default=(), repr=False)

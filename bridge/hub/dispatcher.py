@@ -45,7 +45,10 @@ class Dispatcher:
         return ready
 
     def checked(self, payload: bytes, what: str) -> bytes:
-        """Return a payload; if it exceeds the limit, raise a RefusedOperationError that calls it `what`."""
+        """Return a payload that does not exceed the size limit.
+
+        Raises a RefusedOperationError if the payload is larger; `what` names the payload in the error.
+        """
         if len(payload) > self._limits.message_bytes:
             raise RefusedOperationError(f"{what} has more than {self._limits.message_bytes} bytes")
         return payload

@@ -48,35 +48,36 @@ class RefusedOperationError(BridgeError):
 class HubLimits:
     """Bounds of one hub, all above 0. Sizes are bytes, times are seconds.
 
-    An operation that exceeds a bound is refused and logged without an answer, as the reference server does
-    for all errors; only calls and goals are answered, with `result: false`. A client is disconnected only if
-    it could harm others: for a message that is too large, answers that it never reads, or a silent or stuck
-    socket.
+    The hub refuses and logs an operation that exceeds a bound. It answers only calls and goals, with
+    `result: false`; the reference server does not answer errors either. The hub disconnects a client only for
+    a message that is too large, for answers that the client never reads, or for a silent or stuck socket.
 
     Attributes:
-        message_bytes: One WebSocket message, in both directions. A larger one closes the connection with 1009.
-            Incomplete messages in fragments may occupy four times as much (`bridge.codecs.fragments.Reassembler`).
+        message_bytes: Size of one WebSocket message, in both directions. A larger message closes the connection
+            with code 1009. All incomplete messages of a client may together occupy four times this size
+            (`bridge.codecs.fragments.Reassembler`).
         depth: Levels of nested objects and arrays in one message.
-        clients: Simultaneous connections; a further one is refused with HTTP status 503.
+        clients: Number of simultaneous connections. A further connection is refused with HTTP status 503.
         topics: Number of topics of all clients together.
         advertisements_per_client: Open advertise operations (topic and id) of one client.
         subscriptions_per_client: Open subscribe operations (topic and id) of one client.
         services_per_client: Services that one client offers, and as many actions.
         calls_per_client: Open calls that one client made, and as many that it must answer.
         goals_per_client: Open goals that one client sent, and as many that it executes.
-        call_timeout: A call without an answer fails after this time; a client may request less.
-        queue_length: Messages of a topic queued for a slow client that did not request a length; a further one
-            replaces the oldest.
+        call_timeout: Time after which a call without an answer fails. A client may request a shorter time.
+        queue_length: Messages of a topic queued for a slow client that did not request a length. A further
+            message replaces the oldest.
         longest_queue: Maximum `queue_length` that a client can request.
-        client_bytes: All output queued for one client. If it is exceeded, the oldest messages of topics are
-            dropped; a client whose answers alone exceed it is disconnected.
-        latched_bytes: All latched messages together; one that would exceed this is delivered but not latched.
+        client_bytes: All output queued for one client. Beyond this bound, the hub drops the oldest messages of
+            topics. If the client's answers alone exceed the bound, the hub disconnects the client.
+        latched_bytes: All latched messages together. A message that would exceed this bound is delivered but not
+            latched.
         parameters: Number of parameters of ROS (see `bridge.hub.rosapi`).
         parameter_bytes: The values of all parameters together, as JSON.
         handshake_timeout: Time from the TCP connection to a valid WebSocket request.
-        ping_interval: A client silent for this long is pinged.
-        ping_timeout: A client that remains silent for this long after a ping is disconnected.
-        stuck_timeout: A client whose socket accepts nothing for this long, while data waits, is disconnected.
+        ping_interval: Silence of a client after which the hub pings the client.
+        ping_timeout: Silence of a client after a ping, after which the hub disconnects the client.
+        stuck_timeout: Time after which the hub disconnects a client if data waits but the socket accepts nothing.
     """
 
     message_bytes: int = MAX_SIZE

@@ -42,20 +42,22 @@ def model(
     array: bool = False,
     on_missing: Literal["error", "missing"] = "missing",
 ) -> Question:
-    """Return the question: where is the boat, given what it measures? Likelihoods are those at the cells' centres.
+    """Return the question for the boat's cell, given its readings.
+
+    The likelihoods of a cell are computed at the centre of the cell.
 
     Args:
-        width: Cells along x; the thesis ran 32 and describes 64.
-        height: Cells along y.
-        distance_step: Map units between distinguishable distances; readings are whole numbers 0..100, others
-            are clamped and the first and last bins hold the tails.
-        bearing_step: Degrees between distinguishable bearings; a divisor of 360.
-        array: Whether readings are six numbers in a std_msgs/Float64MultiArray, in the order of the columns,
-            instead of fields named after the sensors; for servers that accept only installed message types.
+        width: Number of cells along x. The thesis ran 32 and describes 64.
+        height: Number of cells along y.
+        distance_step: Map units between distinguishable distances. Readings are whole numbers 0..100, and other
+            readings are clamped. The first and the last bin hold the tails of the distribution.
+        bearing_step: Degrees between distinguishable bearings, a divisor of 360.
+        array: Whether readings are six numbers in a std_msgs/Float64MultiArray, in the order of the columns. By
+            default, they are fields named after the sensors. Use arrays for servers without `boat_msgs`.
         on_missing: `missing` computes frames that lack readings; `error` requires all six.
 
     Raises:
-        ModelError: A grid without cells, or a step that does not fit.
+        ModelError: The grid has no cells, or a step is invalid.
     """
     if not 1 <= distance_step <= LONGEST_DISTANCE:
         raise ModelError(f"distance_step is {distance_step}, expected 1 to {LONGEST_DISTANCE}")

@@ -142,9 +142,10 @@ class Boat:
             self._waypoint = self._next_waypoint()
 
     def measure(self) -> tuple[float | None, ...]:
-        """Return readings D1, D2, D3 (map units) and B1, B2, B3 (radians), with the model's noise; None if unplugged.
+        """Return readings D1, D2, D3 in map units and B1, B2, B3 in radians, with the model's noise.
 
-        A distance may be negative or too long, and a bearing outside one turn; the normaliser corrects both.
+        An unplugged sensor has the reading None. A distance may be negative or too long, and a bearing may exceed
+        one turn. The normaliser corrects these readings.
         """
         noise = 1.0 if self.switches["noise"] else 0.0
         measured: dict[str, float] = {}

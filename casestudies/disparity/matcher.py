@@ -86,15 +86,15 @@ class Stack:
         self._answers = False
 
     async def posteriors(self, tiles: NDArray[np.uint8]) -> tuple[NDArray[np.float64], int]:
-        """Send the tiles, uint8[tiles, filters, pixels, disparities], and wait for their posteriors.
+        """Send the tiles of an image, uint8[tiles, filters, pixels, disparities], and wait for the posteriors.
 
-        Each tile has its own stamp, which identifies its result; late results of an earlier image are skipped.
+        A tile and its result have the same stamp. Late results of an earlier image are skipped.
 
         Returns:
             The posteriors, float64[tiles, pixels, disparities], and the sum of the cycles of all tiles.
 
         Raises:
-            NoResultError: Nothing came in time.
+            NoResultError: No result arrived in time.
             BadResultError: A posterior does not have the size of a tile.
         """
         count, _, pixels, disparities = tiles.shape

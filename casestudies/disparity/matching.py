@@ -75,8 +75,8 @@ def matching_costs(
 def likelihoods(costs: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return P(cost | disparity) relative to cost 0, in the shape of the costs.
 
-    A disparity beyond the border has no cost, and gets the mean likelihood of those that have one, so that it is
-    neither preferred nor excluded. In the first column of pixels, all likelihoods are therefore equal.
+    A disparity beyond the border has no cost. It gets the mean likelihood of the pixel's other disparities, so a
+    missing cost neither favours nor excludes a disparity. In the first column of pixels, all likelihoods are equal.
     """
     scales = np.array(SCALES, np.float32)[:, np.newaxis, np.newaxis, np.newaxis]
     likely = (1 - OUTLIER) * np.exp(-costs / scales) + np.float32(OUTLIER)

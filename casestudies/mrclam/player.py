@@ -136,14 +136,14 @@ async def play(
 ) -> list[PlayedFrame]:
     """Publish each frame, wait for its result before the next one, and return the played frames in order.
 
-    Frames are stamped with the time of their publication, which identifies their results. The first frame is
-    published every second until its result arrives, since the master may not have subscribed yet. Every other
-    frame is published once and counts as lost after `timeout_s`.
+    A frame's stamp is the time of publication, and the frame's result has this stamp too. The first frame is
+    published every second until its result arrives, because the master may not have subscribed yet. Every other
+    frame is published once, and counts as lost after `timeout_s`.
 
     Raises:
         NoResultError: The first frame had no result.
         BadResultError: A message was not a result.
-        BridgeError: No rosbridge server answers at the URI, or it was lost.
+        BridgeError: No rosbridge server answers at the URI, or the connection was lost.
     """
     played: list[PlayedFrame] = []
     async with connect(uri, retry=True, on_state=report_connection(uri)) as ros, listen(ros) as listener:

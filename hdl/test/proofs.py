@@ -39,15 +39,15 @@ def proofs() -> tuple[str, ...]:
 
 
 def failed_proof(name: str, folder: Path, hdl: Path = HDL) -> str | None:
-    """Try a proof, and return why it fails, or None.
+    """Try a proof, and return the reason why the proof fails, or None if it succeeds.
 
     Args:
-        name: One of `proofs`.
+        name: Name of the proof, from `proofs`.
         folder: Working folder of the tools.
         hdl: Folder of the VHDL: `HDL`, or a changed copy (a mutant).
 
     Raises:
-        HardwareToolError: GHDL is not installed or refuses the hardware.
+        HardwareToolError: GHDL is not installed, or refuses the VHDL.
     """
     write_hardware_files(random_case(0).image, folder)
     if name == "guard":

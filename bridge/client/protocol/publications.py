@@ -105,7 +105,10 @@ class Publications:
         return ros1_type(type_name) in self._definitions
 
     def define(self, type_name: str, definitions: Definitions) -> None:
-        """Store definitions for a type; if it is among them, check the next message of each topic with that type."""
+        """Store the definitions for a message type.
+
+        If the definitions include the type itself, the next message of each advertisement of this type is checked.
+        """
         self._definitions[ros1_type(type_name)] = definitions
         for advertised in self._advertised.values():
             if same_type(advertised.type, type_name):

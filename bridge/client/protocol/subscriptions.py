@@ -32,18 +32,19 @@ _ENVELOPES: Final = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Delivery:
-    """Settings for the delivery of a topic's messages; a client uses one for all of its subscriptions to the topic.
+    """Settings for the delivery of a topic's messages, shared by all subscriptions of a client to the topic.
 
     Attributes:
         throttle_rate: Minimum number of milliseconds between two messages.
         queue_length: Number of throttled messages that the server queues.
         compression: `none` for JSON, `cbor` for long arrays, `cbor-raw` for the serialised bytes alone. Many
-            servers ignore an unknown value and send JSON.
+            servers ignore an unknown compression and send JSON.
         arrays: Python type of arrays of numbers, regardless of the encoding.
-        fragment_size: Maximum number of characters in a fragment; None for whole messages. Servers apply the
-            last value that a client requested to everything they send to it.
+        fragment_size: Maximum number of characters in a fragment, or None for whole messages. A server applies
+            the last value that a client requested to all messages for this client.
         qos: Quality of service in ROS 2.
-        max_bytes: Maximum size of a message in bytes; larger ones are discarded. None for the connection's limit.
+        max_bytes: Maximum size of a message in bytes, or None for the connection's limit. The client discards
+            larger messages.
     """
 
     throttle_rate: int = 0
@@ -345,7 +346,10 @@ class Subscriptions:
     def receive(
         self, operation: dict[str, Any], data: bytes, *, from_cbor: bool = False
     ) -> MessageReceived | MessageDiscarded | UnusableReceived | None:
-        """Handle a publish operation, decoded from `data`; None if its topic is not subscribed to."""
+        """Handle a publish operation that was decoded from `data`.
+
+        Return None if the client does not subscribe to the topic.
+        """
         topic = operation.get("topic")
         msg = operation.get("msg")
         if type(topic) is not str or type(msg) is not dict:
