@@ -1,7 +1,7 @@
 """Errors of rosbridge connections, each with one sentence for the user.
 
 `str(error)` states what happened, where it happened, and what was expected. Some errors add advice. If an error
-ends a command, the command exits with the error's `exit_code`. Other subclasses inherit the code of their base:
+ends a command, the command exits with the error's `exit_code`. Classes that are not listed inherit their code:
 
 * `BridgeError`: 3, caused by the server or by its messages
     * `UsageError`: 2, caused by usage, configuration or credentials

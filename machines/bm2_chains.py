@@ -428,10 +428,13 @@ def run_in_step(  # noqa: PLR0915 - vectors are not passed to functions
     vectors: tuple[Words, ...],
     limits: tuple[int, ...],
 ) -> bool:
-    """Run chains in step until their samples are drawn; return False if a chain may reach a limit before that.
+    """Run chains in step until each chain has drawn its samples, and return True.
 
-    `numbers` are random numbers. Of the vectors, `clock` has three rows with a value for each chain: the place of its
-    next cycle in `numbers`, the place where its block of cycles ends, and the block's first cycle.
+    Return False as soon as a chain may reach `max_cycles` or `ops_timeout`.
+
+    `numbers` are random numbers, stored in blocks of cycles. The vector `clock` has a value for each chain in three
+    rows: the place of the chain's next cycle in `numbers`, the place where the chain's block ends, and the first
+    cycle of this block.
     """
     values, addresses, results, clock, room = vectors
     burn_in, samples, max_cycles, ops_timeout = limits

@@ -24,10 +24,11 @@ class BoardSamples:
     """The samples that one board has drawn in a frame.
 
     Attributes:
-        reason: Its last stop reason.
-        counts: uint32[batches, values], the number of samples with each joint value of the searched variables, from the
-            frame's start to the end of each batch.
-        values: int[samples], the index of each sample's joint value, -1 for an unused code; None without a stream.
+        reason: The board's last stop reason.
+        counts: uint32[batches, values], the number of samples with each joint value of the searched variables. The
+            counts of a batch cover the frame up to the end of the batch.
+        values: int[samples], the index of each sample's joint value. The index is -1 if a variable has an unused code.
+            `values` is None if the board does not stream samples.
     """
 
     reason: BM2StopReason

@@ -78,10 +78,12 @@ class BM2Kernel(ABC):
         )
 
     def start(self, start: BM2Start, pause_at: int = 0) -> BM2StopReason:
-        """Run a new frame from its start state, until it stops or pauses after cycle `pause_at` (0: no pause).
+        """Run a new frame from the start state, and return the reason why the machine stopped.
+
+        The machine pauses after cycle `pause_at`, unless `pause_at` is 0.
 
         Raises:
-            StartError: The start does not fit the machine; nothing has changed.
+            StartError: The start does not fit the machine. The machine is unchanged.
         """
         check_bm2_start(self._parameters, start)
         check_start_value("pause_at", pause_at, 0, CYCLES_MAX)

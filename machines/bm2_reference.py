@@ -55,7 +55,7 @@ class ReferenceBM2(BM2Kernel):
                 self.reason = BM2StopReason.PAUSED
 
     def _cycle(self) -> BM2StopReason:
-        """Run one cycle: of the bits that the sequencer chose, write those whose CDEs agree; step all generators."""
+        """Run one cycle: write each bit of the move for which its CDEs agree, and step all generators."""
         random = self._random_numbers.show(self._states).tolist()
         for bit in tuple(self._pending):
             # no CDE of this bit sees another bit of the move

@@ -83,12 +83,12 @@ class BM1Kernel(ABC):
         return self.reason
 
     def resume(self, run_until: int, halted: Collection[int] = ()) -> StopReason:
-        """Run the next slice of the same frame, to cycle `run_until` at most; 0 for no further slices.
+        """Run the next slice of the current frame, up to cycle `run_until`. If `run_until` is 0, run to the end.
 
-        The replicas with the indices `halted` do not continue in this frame: they keep the reason `SLICE`.
+        The replicas with the indices `halted` do not continue in this frame. They keep the reason `SLICE`.
 
         Raises:
-            StartError: No frame can be continued, or `run_until` is not a later cycle; nothing has changed.
+            StartError: No frame can be continued, or `run_until` is not a later cycle. The machine is unchanged.
         """
         halts = self._halted | set(halted)
         self._check_resume(run_until, halted, halts)

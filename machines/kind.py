@@ -254,10 +254,10 @@ class MachineKind(ABC):
     """A kind of Bayesian machine. Each kind has its own types of machines, parameters and kernels.
 
     Attributes:
-        name: Its name in programming files and deployments.
-        has_hardware: True if there is VHDL of such machines.
-        parameters: The type of its parameters: a dataclass.
-        reasons: Its stop reasons, in words for users, by their number in the status register; 0 means not started.
+        name: Name of the kind in programming files and deployments.
+        has_hardware: True if machines of this kind exist in VHDL.
+        parameters: Dataclass of the machine's parameters.
+        reasons: Stop reasons in words for users, by the number in the status register. 0 means not started.
     """
 
     name: ClassVar[str]

@@ -19,7 +19,7 @@ Octets: TypeAlias = bytes | bytearray | memoryview
 GREET: Final = 1
 """Board to host, the first frame of a link: the `Greeting`."""
 READ: Final = 2
-"""Host to board: read `count` words from `address` on; the reply contains them."""
+"""Host to board: read `count` words, starting at `address`. The reply contains the words."""
 WRITE: Final = 3
 """Host to board: write the payload from `address` on; acknowledged, unless posted."""
 IRQ: Final = 4

@@ -126,10 +126,12 @@ class Posteriors:
         return await self._within(timeout, self.__anext__)
 
     async def next_frame(self, timeout: float | None) -> FrameOutcome:
-        """Wait for one frame: return its posterior, or its `FrameReport` with the reason if it has none.
+        """Wait for one frame, `timeout` seconds at most; None for no limit.
+
+        Return the frame's posterior, or for a frame without a posterior its `FrameReport`, which gives the reason.
 
         Raises:
-            NoResultError, BadResultError, DisconnectedError, ConcurrentReadError: As for `next`.
+            NoResultError, BadResultError, DisconnectedError, ConcurrentReadError: The conditions are those of `next`.
         """
         return await self._within(timeout, self._take)
 

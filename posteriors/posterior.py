@@ -342,9 +342,9 @@ def samples_layout(samples: int, sample_bytes: int) -> dict[str, Any]:
 def read_samples(message: dict[str, Any], sizes: Sequence[int] = (), newest: int = 0) -> "NDArray[np.int64]":
     """Return the sampled states in a message on `/bm/samples` as values of variables, int64[samples, variables].
 
-    `sizes` has the number of values of each variable, in the order of the machine; a sampled value that is not below it
-    is an unused code. Without sizes, return the states' machine words, int64[samples, words]. If `newest` is not 0,
-    return at most that many samples, the newest.
+    `sizes` has the number of values of each variable, in the order of the machine. If a sampled value is not below
+    the variable's size, it is an unused code. Without sizes, return the machine words of the states,
+    int64[samples, words]. If `newest` is not 0, return only the newest samples, at most `newest` of them.
 
     Raises:
         BadResultError: The message does not hold states of this machine.

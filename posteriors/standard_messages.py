@@ -55,8 +55,9 @@ class Plane(NamedTuple):
     def of(cls, dimensions: Sequence[Dimension], *, square: bool = False) -> Self:
         """Return the plane of a result's dimensions.
 
-        A ValueError if they span no plane, or if `square` is True and the plane's cells are not square.
-        x and y are the variables of these names; with other names, the last one is x.
+        Variables named x and y become the axes of these names. With other names, the last variable is x.
+
+        Raises a ValueError if the dimensions span no plane, or if `square` is set and the cells are not square.
         """
         if len(dimensions) != 2 or dimensions[0].label == REPLICA:
             raise ValueError(f"a posterior over {', '.join(each.label for each in dimensions)} is no plane")

@@ -322,7 +322,10 @@ async def end_all(children: Iterable[Child], stop_timeout: float) -> list[str]:
 
 
 def end_with_parent() -> None:
-    """In a child of rosbayes: exit when the parent ends, even by SIGKILL; a StoppedError if it has already ended."""
+    """Make this child process exit when its parent ends, even if the parent ends by SIGKILL.
+
+    Raises a StoppedError if the parent has already ended. If rosbayes did not start this process, do nothing.
+    """
     parent = os.environ.get(PARENT_VARIABLE)
     if parent is None or not parent.isdigit():
         return

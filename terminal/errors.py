@@ -31,7 +31,7 @@ class StoppedError(BaseException):
 
 
 class ReaderGoneError(Exception):
-    """The reader of standard output has closed it, as `| head` does; this is not a failure."""
+    """The reader of standard output, for example `head` in a pipe, has closed the pipe. This is no failure."""
 
     exit_code = ExitCode.DONE
 

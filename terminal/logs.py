@@ -34,7 +34,7 @@ class _Process:
     """State of this process's output on standard error."""
 
     name = ""
-    """The name of the process in JSON lines if it differs from that of its command; set at start-up."""
+    """The name of the process in JSON lines, set at start-up. It is empty if the command's name is used."""
     shows_progress = False
     """True while the last line of the terminal shows progress, which the next line replaces."""
 
@@ -129,7 +129,7 @@ def _write(text: str) -> None:
 
 
 class Logger:
-    """The log of a process. Lines below its level are omitted; fields whose names begin with `_` are only in JSON."""
+    """The log of a process, without lines below a level. Fields with names that begin with `_` are only in JSON."""
 
     def __init__(self, role: str, level: str) -> None:
         self._role = role

@@ -157,9 +157,10 @@ def _show_command(name: str, words: Sequence[str]) -> None:
 
 
 class Process:
-    """A process and the lines it prints, which go to a log, and also to `show` if it is given.
+    """A process that this process starts, and the lines that it prints.
 
-    With `forks`, it is forked from this process, which is faster (see `fork_command`).
+    The lines are written to a log and, if `show` is given, passed to `show`. With `forks`, this process forks the new
+    process instead of starting a program; this is faster (see `fork_command`).
     """
 
     def __init__(

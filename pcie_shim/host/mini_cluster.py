@@ -5,8 +5,8 @@
              resume to those that ◀────┘                                      │
              have not stopped      ◀──────────────── no ──────────────────────┘
 
-The sensors and the start of a frame are posted to every board before waiting for the first one; when all have
-stopped, their results are read. Boards stop together (`slices`) or independently (`own`, as in the thesis).
+The host posts the sensors and the start of a frame to every board, and only then waits. When all boards have
+stopped, it reads their results. Boards stop together (`slices`) or independently (`own`, as in the thesis).
 """
 
 import select

@@ -1,11 +1,11 @@
-"""Work on a dask scheduler against the same work in one process: a sweep of designs, and a recording.
+"""Work on a dask scheduler, compared with this work in one process: a sweep of designs, and a recording.
 
 alone      ─▶ work(in_this_process)
-at once    ─▶ the same in a process on each core: what the machine can do
+at once    ─▶ work(in_this_process) in a process on each core: what the machine can do
             this process ─▶ scheduler ─▶ a worker on each core                efficiency = alone / (cores * seconds)
-hosts 1-4  ─▶ the same, with a worker in each of several network namespaces   bytes on the wire
+hosts 1-4  ─▶ scheduler ─▶ a worker in each of several network namespaces     bytes on the wire
 
-These are measured one after the other, in rounds, whose medians are shown.
+A round measures each setting once, one after the other. The tables show the medians of the rounds.
 """
 
 from __future__ import annotations

@@ -1,4 +1,6 @@
-"""Cycle time, from publishing a reading to the arrival of its result, compared with that of an echo (the floor).
+"""Cycle time of a stack, compared with the cycle time of an echo (the floor).
+
+A cycle lasts from the publication of a reading to the arrival of its result.
 
 processes  client --reading--> hub --> subscriber -> master -> pcie-app -> 4 boards -> pcie-app -> master -> publisher --> hub --> client
 fused      client --reading--> hub --> master --------------> 4 boards --------------> master -----------------------> hub --> client

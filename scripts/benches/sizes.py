@@ -2,8 +2,8 @@
 
 client --reading of n bytes--> hub --> master and its services --> one board of l lines and c columns --> ... --> client
 
-One size varies at a time. The lines of a larger machine repeat those of the smallest, and a sensor's two readings
-are nearly equally probable, so that frames of 30 sensors have a posterior too, and the machines differ only in size.
+One size varies at a time. The lines of a larger machine repeat the lines of the smallest machine, so machines differ
+only in size. The two readings of a sensor are nearly equally probable, so even frames of 30 sensors have a posterior.
 """
 
 import argparse

@@ -33,8 +33,8 @@ class View:
     """The choices of one browser.
 
     Attributes:
-        at: Place of the frame that is shown; None for the newest one.
-        chosen: The one or two labels whose marginal is shown; empty for the default.
+        at: Place of the frame that is shown, or None for the newest frame.
+        chosen: Labels of the one or two variables whose marginal is shown. If it is empty, the default is shown.
     """
 
     def __init__(self, feed: Feed) -> None:

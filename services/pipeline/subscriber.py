@@ -149,11 +149,11 @@ class Subscriber(RunService):
             self._link.notice("info", f"rosbridge at {uri} is connected again")
 
     async def _serve(self) -> None:
-        """Send readings.
+        """Send readings to the master, until an error ends the service.
 
         Raises:
             BridgeError: A server is unreachable, or no message of a topic arrives in time.
-            RosbridgeLostError: A run with `--once` lost its server.
+            RosbridgeLostError: The connection to a server was lost in a run with `--once`.
         """
         settings, sources = self._settings, self._deployment.sources
         self._lost = asyncio.get_running_loop().create_future()

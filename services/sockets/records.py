@@ -128,9 +128,10 @@ class Trouble(Record, tag="trouble", frozen=True):
 # --- a frame, in the order of sending --------------------------------------------------------------
 
 Addresses = list[int | list[int] | None]
-"""Addresses of a frame's readings, in the order of the variables; None for a missing reading.
+"""Addresses of a frame's readings, in the order of the variables. None is a missing reading.
 
-If replicas or cells have readings of their own, each variable has a flat list (row by row, -1 for a missing reading).
+If replicas or cells have readings of their own, each variable has a flat list, row by row. In a list, -1 is a missing
+reading.
 """
 
 Values = list[float | str | None]

@@ -104,7 +104,7 @@ def losses_of(deployment: Deployment, whole: BM1Machine, model: Model) -> tuple[
     """Return the quantisation loss of the model, or None if the codes were edited since the build.
 
     Raises:
-        BuildError: The codes are those of another model.
+        BuildError: The codes were built from another model or with other settings.
     """
     if model.lines == deployment.machine.lines and len(model.known) == whole.parameters.sensors:
         quantised = quantise(

@@ -118,8 +118,8 @@ def placed(
 ) -> tuple[Variable, ...]:
     """Return variables as changed by `--order` and `--path`, or raise a BuildError.
 
-    `order` says which sensor each column reads: a column keeps its table and its conversion to addresses, but gets the
-    name, source and path of that sensor.
+    `order` names the sensor that each column reads. A column keeps its table and its conversion to addresses. It gets
+    the name, source and path of the sensor that it reads.
     """
     columns = {variable.name: variable for variable in variables if variable.kind == "sensor"}
     names = names_in("--order", order or "") or list(columns)

@@ -84,13 +84,13 @@ note: Final = partial(Finding, Severity.NOTE)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedMachine:
-    """A BM1 to check: all its lines, whichever board has them.
+    """A BM1 to check, with the lines of all its boards.
 
     Attributes:
-        deployment: Its deployment, with variables, lines and limits.
-        board: The machine of the first board: parameters and random numbers are the same on all boards.
-        prior: uint16[rows, lines], the prior's codes with the lines of all boards.
-        tables: One uint16[2**bits, lines] per column, with the lines of all boards.
+        deployment: The machine's deployment, with variables, lines and limits.
+        board: The machine of the first board. All boards have its parameters and random numbers.
+        prior: uint16[rows, lines], the prior's codes for the lines of all boards.
+        tables: uint16[2**bits, lines] for each column, the column's codes for the lines of all boards.
         model: The model with the probabilities, or None if only the codes are known.
     """
 

@@ -217,10 +217,10 @@ class Source(Section):
 
 
 class Variable(Section):
-    """`[[variable]]`: a known variable, and how its readings become addresses.
+    """`[[variable]]`: a known variable, and the conversion of its readings to addresses.
 
     A variable of kind `sensor` is a column of the machine. A variable of kind `prior_select` selects the row
-    of the prior's table (thesis 2.1.2), whose top row, for a missing reading, is the prior without a
+    of the prior's table (thesis 2.1.2). A missing reading selects the table's top row, the prior without a
     selection.
     """
 

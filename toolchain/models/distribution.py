@@ -244,7 +244,7 @@ class Symbol:
 
 
 Formula: TypeAlias = Callable[..., ArrayLike] | ArrayLike
-"""A function of the parents' values, which are float64 arrays of the same shape; or constant numbers."""
+"""A function of the parents' values, or constant numbers. The function gets float64 arrays of equal shape."""
 
 _SUM_TOLERANCE: Final = 1e-6
 

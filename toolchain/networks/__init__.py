@@ -38,10 +38,12 @@ def is_network(path: Path) -> bool:
 
 
 def read_network(path: Path, *, on_missing: Literal["error", "missing"] = "error") -> JointDistribution:
-    """Return the joint distribution in a network file; its name ends in one of `SUFFIXES`, and `.gz` may follow.
+    """Return the joint distribution in a network file.
+
+    The file's name ends in one of `SUFFIXES`, or in such a suffix and `.gz`.
 
     Raises:
-        NetworkFileError: The file is missing, too large, or not a network; the error names file and line.
+        NetworkFileError: The file is missing, too large, or not a network. The error names file and line.
     """
     from toolchain.networks.builder import NetworkBuilder
 

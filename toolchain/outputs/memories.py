@@ -1,9 +1,10 @@
 """The memories of a machine on each board, with a MIF for each: priors, tiles, CDEs, random numbers (thesis 3.2).
 
-All tiles of a column have the same reading, so a column is one memory. Its address is that of the reading, and a word
+All tiles of a column have the same reading, so a column is one memory. The reading gives the memory's address. A word
 contains the codes of all lines of the board, with line 0 in the lowest bits. The prior elements are also one memory.
-If each line has its own reading, each tile is a separate memory with the tile's bits of every word. A BM2 has a
-memory for each CDE (conditional distribution encoder), the same on all boards (thesis 2.1.3).
+If each line has its own reading, each tile is a memory of its own, which contains only the codes of the tile's line.
+
+A BM2 has a memory for each CDE (conditional distribution encoder, thesis 2.1.3). All boards have equal memories.
 """
 
 import math

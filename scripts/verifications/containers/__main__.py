@@ -286,7 +286,10 @@ run serial; run cluster "--scheduler tcp://127.0.0.1:8786"
 cmp serial.npz cluster.npz; cmp serial.jsonl cluster.jsonl
 python -c "from urllib.request import urlopen; print(urlopen('http://127.0.0.1:8787/status').read())"
 """
-"""Script of a host: compute a recording and a sweep in one process, then on the cluster; print a page from dask."""
+"""Script that computes a recording and a sweep in one process and on the cluster, and prints a page from dask.
+
+The script fails if the cluster's files differ from those of one process.
+"""
 
 
 def check_cluster(stack: Stack) -> None:
