@@ -252,8 +252,8 @@ class ActionServer(Handle):
 
     Attributes:
         name: Name of the action.
-        result_check: Checks results before they are sent, if their type is known.
-        feedback_check: Checks feedback before it is sent, if its type is known.
+        result_check: Check of each result before it is sent, or None if the result's type is unknown.
+        feedback_check: Check of each feedback before it is sent, or None if the feedback's type is unknown.
     """
 
     def __init__(self, session: Session, name: str, type_name: str, handler: GoalHandler) -> None:

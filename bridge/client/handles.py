@@ -93,16 +93,17 @@ def _check_queue_size(size: int, topic: str) -> int:
 class Subscription(Handle):
     """The messages of one topic, to be read by one task: `async for message in subscription`.
 
-    If the reader is too slow, the oldest messages are dropped; the connection is not affected. The iteration
-    continues after a lost connection, and ends when the subscription or the client is closed. If the topic is
-    left out, because its messages are too large for the connection, reading raises `TopicLeftOutError`.
+    If the reader is too slow, the oldest messages are dropped. A slow reader does not affect the connection.
+    The iteration continues after a lost connection. It ends when the subscription or the client is closed.
+    If a message is too large for the connection, the client leaves the topic out. Reading then raises a
+    `TopicLeftOutError`.
 
     Attributes:
         topic: Name of the topic.
         lost: Number of messages dropped because the queue was full.
         discarded: Number of messages discarded because they were larger than `max_bytes`.
-        blind_seconds: Total time in which messages may have been missed: each time, from the last data of a lost
-            connection until the topic is subscribed to again.
+        blind_seconds: Total time in which messages may have been missed. After each lost connection, this time
+            lasts from the last data until the client subscribes to the topic again.
     """
 
     def __init__(

@@ -62,7 +62,9 @@ class TypeChecks:
         publications.define(type_name, definitions)
 
     async def check_request(self, service: str, args: Mapping[str, Any], limit: float) -> None:
-        """Check a request for a service; each question to rosapi about its type takes at most `limit` seconds.
+        """Check a request for a service against the service's type.
+
+        The client asks rosapi for an unknown type. Each question to rosapi takes at most `limit` seconds.
 
         Raises:
             MessageTypeError: The request has a field that the type does not have, or an array of another shape.

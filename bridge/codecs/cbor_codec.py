@@ -1,11 +1,11 @@
 """CBOR on the wire: one map per message, typed arrays without intermediate lists, limits of size and depth.
 
-rosbridge servers send CBOR (RFC 8949) to subscribers that ask for `compression: cbor`: arrays of numbers as
-typed arrays (RFC 8746, little endian), `uint8[]` as a byte string. Clients send JSON.
+rosbridge servers send CBOR (RFC 8949) to subscribers that ask for `compression: cbor`. An array of numbers is a
+typed array (RFC 8746, little endian). An array `uint8[]` is a byte string. Clients send JSON.
 
-Inbound, only the part of CBOR that ROS messages need is accepted: maps with text keys, arrays, text, byte strings,
-numbers, booleans, null, and typed arrays. Every other tag (shared references, bignums, regular expressions, dates)
-is refused before it is decoded. NaN and infinities are numbers here, as in ROS.
+The decoder accepts only the part of CBOR that ROS messages need: maps with text keys, arrays, typed arrays, text,
+byte strings, numbers, booleans and null. The decoder refuses all other tags, such as bignums and dates, before it
+decodes their content. NaN and infinities are numbers, as in ROS.
 
 NumPy is imported when the first array is requested.
 """

@@ -126,7 +126,10 @@ def is_deeper(data: bytes, limit: int) -> bool:
 
 
 def _has_more_brackets(data: bytes, limit: int) -> bool:
-    """Return whether JSON has more than `limit` opening brackets; if not, it cannot be nested more deeply than that."""
+    """Return whether JSON has more than `limit` opening brackets.
+
+    JSON with at most `limit` opening brackets is nested at most `limit` levels deep.
+    """
     if len(data) <= _COUNTED:
         return data.count(b"{") + data.count(b"[") > limit
     # Searching for the next bracket skips long arrays of numbers forty times faster than counting.

@@ -112,7 +112,7 @@ class MessageCheck:
     """The check of messages of one type."""
 
     def __init__(self, type_name: str, definitions: Definitions) -> None:
-        """Prepare the check of a type that is among the definitions; its name has the form of ROS 1."""
+        """Prepare the check of the type `type_name`, a key of `definitions` in the ROS 1 form `package/Type`."""
         self._type = type_name
         self._definitions = definitions
 

@@ -21,7 +21,10 @@ from websockets.typing import Origin, Subprotocol
 from bridge.hub.limits import HubError
 
 SUBPROTOCOL: Final = Subprotocol("rosbridge")
-"""The hub's subprotocol, for clients that request it; a client that requests only other ones disconnects by itself."""
+"""The hub's subprotocol, which a client may request.
+
+The hub accepts no other subprotocol. A client that requests only other subprotocols disconnects by itself.
+"""
 _BEARER: Final = "bearer."
 # Tokens of characters that both a header and a subprotocol accept.
 _TOKEN: Final = re.compile(r"[A-Za-z0-9._~-]{16,1024}")

@@ -13,9 +13,9 @@
     caller ─ cancel_action_goal ─▶ hub ─ cancel_action_goal ─▶ server     a request: the server still ends the goal
     caller ◀─── action_result ──── hub ◀─── action_result ──── server
 
-The server here is the client that offers the service or action. The hub replaces the caller's id by a key of its own,
-because ids of different clients may be equal. It ends a call or a goal itself, with `result: false`, when the server
-leaves, and a call also when its deadline passes.
+The server here is the client that offers the service or action. Ids of different clients may be equal, so the hub
+replaces the caller's id by a key of its own. If the server leaves, the hub ends the server's calls and goals with
+`result: false`. If the deadline of a call passes, the hub ends the call in the same way.
 """
 
 import heapq

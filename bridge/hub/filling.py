@@ -60,7 +60,10 @@ class Filler:
         self.count = -1 if is_time else len(defaults)
 
     def named(self, values: list[Any]) -> dict[str, Any]:
-        """Return a message from values in the order of its fields; arguments of services may be such a list."""
+        """Return the message whose fields have these values, in the order of the fields.
+
+        A caller may pass the arguments of a service as a list of values instead of an object.
+        """
         return dict(zip(self._defaults, values, strict=False))
 
     def fill(self, message: dict[str, Any], room: int, *, keep: bool = True) -> bytes | None:

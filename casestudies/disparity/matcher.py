@@ -61,9 +61,10 @@ _SILENT_S: Final = 5.0
 
 
 def tiles_of(codes: NDArray[np.uint8], pixels: int) -> NDArray[np.uint8]:
-    """Return the bytes of an image, [filters, disparities, height, width], as uint8[tiles, filters, pixels, disparities].
+    """Return the codes of an image as tiles, uint8[tiles, filters, pixels, disparities].
 
-    The last tile is filled up with pixels whose likelihoods are all 255; their machines stop first.
+    `codes` has the shape [filters, disparities, height, width]. The last tile is filled up with pixels whose
+    likelihoods are all 255. The machines of the added pixels stop first.
     """
     filters, disparities = codes.shape[:2]
     flat = codes.reshape(filters, disparities, -1)

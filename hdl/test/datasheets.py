@@ -29,11 +29,11 @@ _PORTS = re.compile(r"^  port \(\n(.*?)^  \);", re.DOTALL | re.MULTILINE)
 
 @dataclass(frozen=True)
 class Unit:
-    """The contents of a unit's header and entity.
+    """The contents of a VHDL file's header and entity declaration.
 
     Attributes:
         name: Name of the entity.
-        purpose: Sentence in the header.
+        purpose: Sentence of the header that states the purpose of the unit.
         generics: Name, type, default and comment of each generic.
         ports: Name, direction, type and comment of each port.
     """

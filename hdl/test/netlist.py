@@ -21,7 +21,10 @@ BLACK_BOX: Final = """
   DATA_BITS = 1) (input clk_i, input enable_i, input [ADDRESS_BITS-1:0] address_i, output [DATA_BITS-1:0] data_o);
 endmodule
 """
-"""Verilog of a table that has only an interface; it replaces every table, so that yosys does not count their cells."""
+"""Verilog of a table that has only an interface.
+
+This module replaces every table, so that yosys does not count the cells of tables.
+"""
 
 _FAMILY: Final = "cyclonev"
 """A family of FPGAs with the same ALM as a Stratix V."""
@@ -32,9 +35,9 @@ class Netlist:
     """Cells of an Intel FPGA with ALMs.
 
     Attributes:
-        luts: Numbers of look-up tables with 1, 2, ... 6 inputs.
+        luts: Number of look-up tables with 1 input, with 2 inputs, and so on up to 6 inputs.
         sums: Number of bits of carry chains.
-        registers: Number of flip-flops, without those at the output of a memory block.
+        registers: Number of flip-flops, without the output registers of memory blocks.
     """
 
     luts: tuple[int, ...]
@@ -55,7 +58,7 @@ class Netlist:
 
 
 def synthesised(image: Image, folder: Path) -> Netlist:
-    """Return the cells into which yosys synthesises an image's hardware, without its tables.
+    """Synthesise an image's hardware with yosys, and return the cells. Cells of tables are not counted.
 
     Raises:
         HardwareToolError: A tool is not installed or failed.

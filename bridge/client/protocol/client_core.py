@@ -44,7 +44,7 @@ class ClientCore:
 
     @property
     def ros_version(self) -> RosVersion | None:
-        """ROS version of the server, as configured or as its messages show; None while unknown."""
+        """The configured ROS version, or the version that the server's messages show, or None while unknown."""
         return self.wire.ros_version or self.subscriptions.seen_version
 
     def restore(self) -> None:

@@ -25,7 +25,10 @@ from bridge.stamps import ros_version_of_message
 Compression = Literal["none", "cbor", "cbor-raw"]
 
 _OF_ENVELOPE: Final = 3
-"""Number of keys (op, topic, msg) of an operation whose envelope, the bytes before its message, can be recognised."""
+"""Number of keys of a publish operation whose envelope can be recognised: `op`, `topic` and `msg`.
+
+The envelope is the part of the operation before the message.
+"""
 _ENVELOPES: Final = 8
 """Maximum number of envelopes tried for one topic, because some servers never repeat one."""
 
