@@ -73,30 +73,30 @@ class BM2StopReason(IntEnum):
 class BM2Parameters:
     """Parameters of a BM2: bit-level Gibbs sampling in a product of factors.
 
-    Each factor has a conditional distribution encoder (CDE). In a move, the sequencer points at one or more bits of the
-    state, which are drawn anew. A sweep points once at each unknown bit; with `random`, a sweep is as many moves as
-    there are unknown bits.
+    Each factor has a conditional distribution encoder (CDE). In a move, the sequencer points at one or more bits of
+    the state, and the machine draws these bits anew. A sweep points once at each unknown bit. With the sequencer
+    `random`, a sweep is as many moves as there are unknown bits.
 
     Attributes:
         cardinalities: Number of values of each variable, in the model's order.
-        factors: Variables of each factor, in rising order; every variable is in a factor.
-        searched: Variables whose joint distribution is counted, in the order of its axes (the first varies slowest).
+        factors: Variables of each factor, in rising order. Every variable is in a factor.
+        searched: Variables whose joint distribution is counted. The first variable varies slowest.
         known: Variables whose values a frame may set, in the order of the frame's addresses.
         prob_bits: Bits of a CDE's probability code (W), 2 to 16.
         sequencer: Default order in which the sequencer points at bits.
-        literal: True: a bit is written when all CDEs of the machine agree on it, as the thesis draws it. False: when
-            all CDEs of the factors that contain the bit agree.
+        literal: Whether all CDEs of the machine must agree before a bit is written, as the thesis draws it.
+            Otherwise only the CDEs whose factor contains the bit must agree.
         sample_every: Interval of samples: a sweep or a move.
         burn_in: Default number of whole sweeps before the first sample.
         ops_timeout: Default maximum number of cycles of a move.
-        rng: Kind of random number generators; `lfsr8` and `lfsr16` are too narrow.
-        steps_per_clock: Steps of a generator per cycle, a power of two. 0 is replaced by the default, as for a BM1.
-        rng_banks: Number of seed sets of each board; a start selects one.
+        rng: Kind of random number generators. `lfsr8` and `lfsr16` are refused, because they bias the samples.
+        steps_per_clock: Steps of a generator per cycle, a power of two. 0 stands for the default.
+        rng_banks: Number of seed sets of each board. A start selects one seed set.
         rng_reset: Whether a start restarts the generators.
         ideal_seed: Seed of the `ideal` generator, 64 bits.
         chain: Index of this board, from 0.
-        chains: Total number of boards; each runs a chain of its own.
-        stream: Number of samples that the board can hold for the host to read (the stream); 0 for no stream.
+        chains: Total number of boards. Each board runs a chain of its own.
+        stream: Number of samples that the board can store for the host to read, or 0 for none.
 
     Raises:
         ParameterError: A machine with these parameters cannot be built.

@@ -1,10 +1,12 @@
-"""Many chains of a BM2 at a time, each with the same results as a kernel of its own, bit for bit.
+"""Many chains of a BM2 at a time. Each chain has, bit for bit, the results of a `BM2Kernel` of its own.
 
-Chains of a small network are sliced: bit i of a vector belongs to chain i, and a cycle is a list of logical
-operations on vectors. Each CDE makes a bit for every context (values of the other bits of its factor), and each chain
-takes the bit for the context in its own state. A bit is written in the chains that point at it. Chains of a large
-network go in step: all make the same move, each in its own cycles, and 8 chains at a time are searched for the first
-cycle in which CDEs agree. Other chains run one by one.
+Chains of a small network are bit-sliced: bit i of every vector belongs to chain i. A cycle is a list of logical
+operations on vectors. A context is one choice of values for the other bits of a factor. Each CDE makes a bit for every
+context, and each chain takes the bit for its own context. A bit of the state is written in the chains that point at
+this bit.
+
+Chains of a large network go in step: all chains make a move together, but each chain takes its own number of cycles.
+Vector operations search 8 chains at a time for the first cycle in which the CDEs agree. Other chains run one by one.
 """
 
 from collections.abc import Sequence
@@ -191,7 +193,10 @@ class Chains:
     def _run_slice(
         self, circuit: _Circuit, moves: Moves, start: BM2Start, states: list[int], seeds: Words
     ) -> _Ran | None:
-        """Run up to 512 chains bit-sliced; return None if one of them may stop before it has drawn all its samples."""
+        """Run up to 512 chains bit-sliced.
+
+        Return None if a chain may stop before it has drawn all its samples.
+        """
         parameters, unknown = self._parameters, circuit.unknown.tolist()
         lfsr, steps = LFSR(parameters.rng), parameters.steps_per_clock
         events = 1 << len(unknown)
@@ -289,11 +294,13 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
     ends: Integers,
     limits: tuple[int, ...],
 ) -> bool:
-    """Run sliced chains to their ends, and set `ends`; return False if a chain may reach a limit before its end.
+    """Run sliced chains to their ends, and store the number of cycles of each chain in `ends`.
 
-    Of the vectors, `counts` has a counter of samples for each state but 0, and a counter of sweeps, which overflows at
-    the end of the burn-in and at the end of the chain. `room` is working space for carries, and for either the
-    contexts' bits or a sample's events.
+    Return False if a chain may reach a limit before its end.
+
+    `vectors` contains `numbers`, `values`, `pointed`, `counts` and `room`. `counts` has a counter of samples for each
+    state but 0. Its other counter counts sweeps, and overflows at the end of the burn-in and at the end of the chain.
+    `room` is working space for carries, for the bits of contexts, and for the events of a sample.
     """
     numbers, values, pointed, counts, room = vectors
     burn_in, samples, max_cycles, window, steps = limits

@@ -75,8 +75,8 @@ def generator_numbers(parameters: RngParameters, bank: int) -> Words:
 class LFSR:
     """A Fibonacci linear feedback shift register of `bits` bits, at most 32.
 
-    A step shifts the state left and shifts in, at the low end, the parity of the bits e - 1 for every exponent e
-    of the polynomial. Its period is 2**bits - 1: it runs through every state but 0.
+    A step shifts the state left by one bit. The new lowest bit is the parity of the bits e - 1, for every exponent e
+    of the polynomial. The period is 2**bits - 1: the register runs through every state but 0.
     """
 
     kind: RngKind
@@ -112,9 +112,10 @@ class LFSR:
     def seeds(self, numbers: Words) -> Words:
         """Return the initial states of the generators with these serial numbers.
 
-        Their distances from a base state are scattered, not even: the states of 3, 5 or 17 columns at even
-        distances would XOR to 0, because 3, 5 and 17 divide 2**32 - 1. The AND of such columns is wrong
-        however many cycles are run.
+        An initial state is a base state after some number of steps, the distance. Distances are scattered
+        and not evenly spaced. With evenly spaced distances, the states of 3, 5 or 17 columns would XOR to 0,
+        because 3, 5 and 17 divide 2**32 - 1. If states XOR to 0, the AND of their columns is wrong, however
+        many cycles are run.
         """
         base = BASE_STATE & self.period or 1
         distances = ((numbers + np.uint64(1)) * np.uint64(GOLDEN)) >> np.uint64(32)

@@ -120,17 +120,18 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
 
     Args:
         folder: The folder that `toolchain build` wrote.
-        readings: The readings by the names of their variables, as in messages: numbers in their units, or names of
-            states. A variable that is left out, or is None, has no reading, even if its `on_missing` is `error`.
-        bank: Number of the set of seeds; each set gives another draw of the same distribution.
+        readings: The reading of each variable, by the variable's name. A reading is a number in the variable's unit,
+            or the name of a state. A variable that is absent or None has no reading, even if the variable's
+            `on_missing` is `error`.
+        bank: Number of the set of seeds. Each set gives another draw of the same distribution.
 
     Returns:
-        The posterior in the shape of the model, with its labels and units; `report` is None.
+        The posterior in the shape of the model, with labels and units. The attribute `report` is None.
 
     Raises:
         LabelError: The deployment has no variable with a name in `readings`.
-        PosteriorError: `readings` is not a mapping; or the machine has replicas, or a reading for each line (then
-            use `machines.posterior`).
+        PosteriorError: `readings` is not a mapping. The error is also raised if the machine has replicas, or a
+            reading for each line. Use `machines.posterior` for such a machine.
         ToolchainError: The deployment is damaged, or a reading cannot be used.
         NoPosteriorError: All counts are 0 for these readings.
     """

@@ -265,21 +265,21 @@ def listen(
 ) -> int:
     """Call a function with each posterior, in this thread, without asyncio.
 
-    The connection runs in its own thread, so a slow function loses posteriors, the oldest first, but not the
+    The connection runs in its own thread. If the function is too slow, it loses the oldest posteriors, but not the
     connection. A lost connection is restored. Ctrl-C ends the loop normally.
 
     Args:
-        server: The URI of a rosbridge server or `robot:NAME`, or an unopened `connect(...)` with further options
-            (a token, a proxy).
-        function: Called with each `Posterior`. Its exceptions end the loop and propagate; returning False
-            also ends the loop.
-        count: Number of posteriors after which to return; None for no limit.
-        first_timeout: Seconds until the first posterior; None for no limit.
-        timeout: Seconds between two posteriors; None for no limit.
-        topic: As in `posteriors`.
-        frame_topic: As in `posteriors`.
-        deployment: As in `posteriors`.
-        queue_size: As in `posteriors`.
+        server: The URI of a rosbridge server, or `robot:NAME`. For further options, such as a token or a proxy, pass
+            an unopened `connect(...)`.
+        function: Called with each `Posterior`. If the function returns False, the loop ends. If it raises an
+            exception, the loop ends, and the exception propagates.
+        count: Number of posteriors after which to return, or None for no limit.
+        first_timeout: Seconds until the first posterior, or None for no limit.
+        timeout: Seconds between two posteriors, or None for no limit.
+        topic: Topic of the posteriors.
+        frame_topic: Topic of the frame reports.
+        deployment: The model's name, to ignore frames of other stacks on the server, or None.
+        queue_size: Maximum number of posteriors that wait for the function.
 
     Returns:
         The number of posteriors passed to the function.

@@ -20,11 +20,11 @@ WAITING: Final = 256
 class Pairing:
     """Pairing of posteriors with reports, whichever of the two arrives first.
 
-    Servers preserve the order within a topic, but not always between topics. So the next posterior belongs to
-    the next report of a published frame, unless their times of arrival (`heard_ns`) show a loss. If the report arrived
-    more than `disorder_ns` after the posterior, the posterior's own report was lost. If it arrived more than
-    `disorder_ns` before, and the report after it is not too late for the posterior, then this earlier report's
-    posterior was lost.
+    Servers preserve the order of messages within a topic, but not always between topics. If nothing is lost, the
+    first waiting posterior belongs to the first waiting report of a published frame. The times of arrival (`heard_ns`)
+    show losses. If the first report arrived more than `disorder_ns` after the posterior, the posterior's own report
+    was lost. The posterior of the first report was lost if two conditions hold: the first report arrived more than
+    `disorder_ns` before the posterior, and the second report is not too late for the posterior.
 
     Attributes:
         announced_only: Number of reports whose posterior never arrived.

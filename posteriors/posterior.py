@@ -244,7 +244,7 @@ class Posterior:
         return summed.transpose([in_order.index(at) for at in kept])
 
     def at(self, indices: Mapping[str, int] | None = None, /, **by_label: int) -> float:
-        """Return the probability of one cell: `posterior.at(y=3, x=4)`, or a mapping such as `best` returns.
+        """Return the probability of one cell: `posterior.at(y=3, x=4)` or `posterior.at(posterior.best())`.
 
         Raises:
             LabelError: A label is unknown or missing, or an index is outside the grid.

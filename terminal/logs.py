@@ -58,7 +58,7 @@ def use_log_format(value: str) -> None:
 
 
 def name_process(name: str) -> None:
-    """Set the name of this process in its JSON lines, which is otherwise that of its command."""
+    """Set the name of this process in its JSON log lines. The default is the name of the command."""
     _Process.name = name
 
 

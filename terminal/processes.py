@@ -249,10 +249,10 @@ class Process:
         return code or 0
 
     async def succeed(self) -> None:
-        """Wait for the successful end of the process.
+        """Wait until the process has ended.
 
         Raises:
-            ProcessError: Its exit code is not 0.
+            ProcessError: The exit code of the process is not 0.
         """
         if code := await self.wait():
             raise self.failure(code)

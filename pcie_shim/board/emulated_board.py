@@ -4,9 +4,9 @@
                ▲                  │                            │
                └───── reset ──────┴────────────────────────────┘ RESUME continues a slice
 
-The whole map is one array of bytes, so a read is a slice, and only registers with side effects need code. The
-machine runs in chunks of about 50 ms (`EmulatedBoard.step`), between which the server can receive a reset.
-Chunks do not change results, because a machine that is stopped and resumed gives the same bits.
+The register map is one array of bytes. Therefore a read is a slice, and only registers with side effects need code.
+The machine runs in chunks of about 50 ms (`EmulatedBoard.step`). Between two chunks, the server can receive a reset.
+Chunks do not change results, because a machine that is stopped and resumed continues with identical bits.
 """
 
 import struct

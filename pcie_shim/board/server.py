@@ -71,7 +71,9 @@ class Board(Protocol):
         """Return `count` words from `address` on, little-endian, or raise a RefusedError."""
 
     def write(self, address: int, words: bytes | memoryview) -> None:
-        """Write little-endian words from `address` on; a doorbell among them takes effect last, and starts the machine.
+        """Write little-endian words from `address` on.
+
+        If the words include a doorbell register, the doorbell takes effect last, and starts the machine.
 
         Raises:
             RefusedError: The board is busy, or an address or value is invalid.

@@ -56,8 +56,8 @@ def serve_one(
 ) -> NoReturn:
     """Serve one board in this process until a signal, then close the board and raise a StoppedError.
 
-    `directory` is the folder of its status socket, if any; `on_ready` is called when the board's two sockets listen,
-    and `on_alive` every second while the board is not stuck.
+    `directory` is the folder of the process's status socket, or None for no status socket. `on_ready` is called when
+    the board's two sockets listen. `on_alive` is called every second while the board is not stuck.
     """
     stop = StopSignal()
     ended_by: list[int] = []

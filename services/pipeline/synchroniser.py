@@ -72,16 +72,19 @@ class _Topic(Generic[Item]):
 class Synchroniser(Generic[Item]):
     """Search for sets of messages within a tolerance of each other.
 
-    Each set has a *pivot*: the newest among the oldest waiting messages of the needed topics, or the oldest
-    waiting message of all if none is needed. Every other topic adds its message nearest to the pivot. The
-    message of a needed topic must be within the tolerance; the message of any other topic must also be nearer to
-    this pivot than to the next message of the pivot's topic. A set waits for nearer messages of topics that are
-    alive, for at most the tolerance. Each message is used once.
+    Each set has a message called the *pivot*. If some topics are needed, the pivot is chosen among the oldest waiting
+    messages of the needed topics: it is the newest of these oldest messages. If no topic is needed, the pivot is the
+    oldest waiting message of all topics.
+
+    Every other topic adds its message nearest to the pivot. All messages of a set must be within the tolerance of the
+    pivot. A message of a topic that is not needed must also be nearer to this pivot than to the next message of the
+    pivot's topic. A set waits at most the tolerance for nearer messages of topics that are alive. Each message is used
+    once.
 
     Attributes:
-        unpaired: number of messages that remained unpaired.
-        deadline: tick at which `take_set` must be called again, or None.
-        absent: indices of the topics that were alive but are not in the last set.
+        unpaired: Number of messages that were dropped without a set.
+        deadline: Tick at which `take_set` must be called again, or None.
+        absent: Indices of the topics that were alive but are not in the last set.
     """
 
     def __init__(self, needed: Sequence[bool], tolerance_ns: int) -> None:

@@ -184,10 +184,10 @@ def shifted(metrics: str, ports: int) -> str:
 async def serve_status(
     directory: Path | None, name: str, get_status: GetStatus, *, metrics: str = "", **more: Any
 ) -> AsyncIterator[None]:
-    """Report the status from the running event loop within the context; `more` is passed to `Report`.
+    """Report the status from the running event loop within the context. `more` is passed to `Report`.
 
-    The directory must exist; without one there is no status socket, and without `metrics` there is no HTTP
-    server. A socket that cannot be opened only causes a warning, because it must not end a robot's run.
+    If `directory` is None, there is no status socket. Otherwise the directory must exist. If `metrics` is empty, there
+    is no HTTP server. If a socket cannot be opened, the process only warns, so that a robot's run does not end.
     """
     _check(directory)
     report, manager = Report(name, get_status, **more), ServiceManager()
