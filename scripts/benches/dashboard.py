@@ -1,8 +1,10 @@
-"""The dashboard: how many of 50 posteriors a second are shown and how late, its cost, and how fast a dragged boat is found.
+"""Measurements of the dashboard: display of 50 posteriors a second, delay after a drag, cost to a cycle.
 
 display  this process -- 50 posteriors a second, 64 x 64 --> hub --> dashboard --> Chromium, one window and two
 drag     mouse in Chromium --> dashboard --> hub --> boat-simulator --> ... --> master --> hub --> dashboard --> Chromium
-cycle    two stacks, one of them with a dashboard and a plain WebSocket reader, because Chromium takes a core of its own
+cycle    a stack with a dashboard and a plain WebSocket reader, compared with a stack without a dashboard
+
+The part `cycle` does without Chromium, because Chromium takes a core of its own.
 """
 
 import argparse

@@ -34,7 +34,10 @@ def run_script(work: Callable[[], Awaitable[int]], limit: float) -> int:
 
 
 def reporting_errors(work: Callable[[], int]) -> int:
-    """Return the exit code of a function, or that of its error, which is reported in one sentence."""
+    """Run a function and return its exit code.
+
+    If the function raises an error, report the error in one sentence, and return the error's exit code.
+    """
     try:
         return work()
     except StoppedError as stopped:

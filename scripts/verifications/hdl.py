@@ -1,5 +1,7 @@
 """Verification of the VHDL: comparison with the emulated board, and proofs (scripts/verify hdl).
 
+Each line shows what is verified, the tools that run it, and the question.
+
 random machines --> GHDL, driven through AXI4-Lite     --> same answers as the emulated board?
 the boat        --> GHDL or Verilator, behind the link --> same answers as four emulated boards?
 units           --> GHDL                               --> correct at values that no machine reaches?

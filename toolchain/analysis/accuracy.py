@@ -1,9 +1,11 @@
-"""Accuracy of a machine's posteriors compared with exact inference; the quantisation loss is also reported separately.
+"""Accuracy of a machine's posteriors compared with exact inference. The quantisation loss is also reported separately.
 
-Each frame has three posteriors over the lines (the values of the searched variables): two by exact inference, from the
-model's probabilities and from the machine's codes, and one from the machine's counts. The first two differ by the
-quantisation loss, the last two by the sampling loss. Means over frames have confidence intervals. A frame without a
-posterior is not left out of a mean: its total variation is 1, and its most probable line is taken to be wrong.
+Each frame has three posteriors over the lines (values of the searched variables). The first is exact inference from
+the model's probabilities. The second is exact inference from the machine's codes. The third comes from the machine's
+counts. The first and the second differ by the quantisation loss. The second and the third differ by the sampling loss.
+
+Means over frames have confidence intervals. A frame without a posterior counts in a mean: its total variation is 1,
+and its most probable line counts as wrong.
 """
 
 import math
@@ -163,14 +165,16 @@ def measure(
 ) -> Accuracy:
     """Run a machine on readings and compare its posteriors with exact inference.
 
-    A replica has the same counts as a single machine with the same bank of seeds, so a single machine is run for all
-    replicas. `replicas` successive readings form a frame, which takes the cycles of their longest run. Without a
-    `model`, the machine is compared only with exact inference on its codes. Readings that are impossible in the model
-    have no posterior. `advance` is called after every reading. With `own`, the filter of a deployment, the readings
-    are a sequence; each is run with one bank, and its posterior is compared with that of the exact filter.
+    `replicas` successive readings form a frame. A frame takes the cycles of its longest run. A single machine is run
+    for all replicas, because replicas with equal seeds have equal counts. Without a `model`, the machine is compared
+    only with exact inference on its codes. A reading that is impossible in the model has no posterior. `advance` is
+    called after every reading.
+
+    `own` is the filter of a deployment. With `own`, the readings are a sequence, and each reading is run with one bank
+    of seeds. Each posterior is compared with the posterior of the exact filter.
 
     Raises:
-        BuildError: Fewer readings than replicas.
+        BuildError: There are fewer readings than replicas.
         ModelError: No frame is possible in the model.
     """
     if len(readings) < replicas:

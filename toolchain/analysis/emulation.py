@@ -95,8 +95,8 @@ class EmulatedBoards:
     def run(self, addresses: Inputs, prior_address: int, bank: int, prior: WrittenPrior = None) -> FrameRun:
         """Run a frame as the host does, with the stop rule of the boards.
 
-        With `Stop.SLICES`, all boards run to the same cycle, which is doubled until a counter reaches the target;
-        otherwise each board runs to its own end.
+        With `Stop.SLICES`, all boards run to a common last cycle. This last cycle is doubled until a counter reaches
+        the target. With `Stop.OWN`, each board runs to its own end.
         """
         end = first_slice(self.target_count) if self.stop is Stop.SLICES else 0
         if end >= self.max_cycles:

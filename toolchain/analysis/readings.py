@@ -118,12 +118,12 @@ def readings_of_lines(
 ) -> Readings:
     """Convert drawn readings for a machine whose lines have their own readings.
 
-    The cell of the true line reads the drawn value. The model does not define the readings of the other
-    lines, so these are drawn from the mean distribution over all lines. With sensor_mode `threshold`, the likelihoods
-    are returned as codes.
+    The cell of the true line reads the drawn value. The model does not define the readings of the other lines.
+    Their readings are drawn from the mean distribution over all lines. With sensor_mode `threshold`, the result also
+    contains the likelihoods as codes.
 
     Raises:
-        BuildError: The readings were not drawn, so their true line is unknown.
+        BuildError: The true lines of `drawn` are unknown, because its readings were not drawn from a model.
     """
     if drawn.lines is None:
         raise BuildError("the true line is known only for drawn readings")

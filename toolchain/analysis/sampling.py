@@ -63,18 +63,21 @@ def drawn_readings(model: NetworkModel, frames: int, seed: int) -> list[Addresse
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sampled:
-    """Results of a BM2 on some readings; intervals are of 95 %, over frames.
+    """Results of a BM2 on some readings. Intervals are 95 % confidence intervals over frames.
+
+    The fields from `alone` to `r_hat` use only the frames with a posterior.
 
     Attributes:
-        frames: All frames.
+        frames: Number of all frames.
         without: Share of frames without a posterior.
-        total_variation: Mean distance from exact inference, 1 for a frame without a posterior; None without a model.
-        alone: The same mean over only the frames with a posterior; all fields below but `reasons` use only these, too.
+        total_variation: Mean total variation from exact inference, or None without a model. A frame without a
+            posterior has a total variation of 1.
+        alone: Mean total variation over only the frames with a posterior, or None without a model.
         cycles: Cycles of the longest-running board.
-        sweep_cycles: Mean cycles of a sweep; 0 if samples are taken after every move.
-        effective_samples: Median and minimum of the effective samples of a frame; 0 if unknown.
-        r_hat: Median R-hat of a frame; 0 for one board, 1e9 if it is infinite.
-        reasons: How often boards stopped for each reason; `impossible` for readings without a possible state.
+        sweep_cycles: Mean cycles of a sweep, or 0 if samples are taken after every move.
+        effective_samples: Median and minimum of the effective samples of a frame. Unknown numbers are 0.
+        r_hat: Median R-hat of a frame. One board has an R-hat of 0. An infinite R-hat is 1e9.
+        reasons: How often boards stopped for each reason. Boards stop with `impossible` if no state is possible.
     """
 
     frames: int

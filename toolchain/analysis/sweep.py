@@ -46,19 +46,20 @@ class Point(BaseModel):
 
     Attributes:
         key: SHA-256 of everything on which the results depend.
-        total_variation: Distance from the model's posterior, mean over all frames; 1 for a frame without a posterior.
-        total_variation_low: Lower end of its 95 % interval.
-        total_variation_high: Upper end of its 95 % interval.
-        quantising: The same distance for exact inference on the codes.
-        map_agreement: Share of all frames with a posterior and the same most probable line.
-        alone_total_variation: The mean distance over only the frames with a posterior; None if no frame has one.
-        alone_map_agreement: The share of these frames that have the same most probable line; None if there are none.
-        kl_bits: KL(machine || model) in bits, mean over these frames; None if there are none.
-        z_rms: Root mean square of z-scores (`ZScores`), ideally 1; None if no line's expected count is high enough.
+        total_variation: Mean total variation from the model's posterior over all frames. A frame without a posterior
+            has a total variation of 1.
+        total_variation_low: Lower end of the 95 % interval of `total_variation`.
+        total_variation_high: Upper end of the 95 % interval of `total_variation`.
+        quantising: Mean total variation of exact inference on the codes from the model's posterior.
+        map_agreement: Share of all frames in which machine and model have the same most probable line.
+        alone_total_variation: `total_variation` over only the frames with a posterior, or None without such frames.
+        alone_map_agreement: `map_agreement` over only the frames with a posterior, or None without such frames.
+        kl_bits: Mean KL(machine || model) in bits over the frames with a posterior, or None without such frames.
+        z_rms: Root mean square of z-scores (`ZScores`), ideally 1. It is None if all expected counts are too low.
         without: Share of runs without a posterior.
         cycles_median: Median cycles of a frame.
-        cycles_95: 95th percentile of the cycles.
-        alms: ALMs of the largest board; None for generators that FPGAs do not have.
+        cycles_95: 95th percentile of the cycles of a frame.
+        alms: ALMs of the largest board, or None if no FPGA has generators of this kind.
         blocks: Memory blocks of the largest board.
         fits: Whether the largest board fits the device.
     """

@@ -261,7 +261,7 @@ class BuildOptions(MachineOptions, TargetOptions):
     rng_table: NDArray[np.uint32] | None = None
     """uint32[length], the random numbers for `rng = table`; None to generate them."""
     sources: SourcesFile | None = None
-    """The file of `--sources`: topics and their variables, in place of `uri`, `topic` and `type`; or None."""
+    """The content of the file of `--sources`, or None. The file replaces `uri`, `topic` and `type`."""
     model_flags: ModelSection = field(default_factory=ModelSection)
     """The flags with which the model was read, for `[model]` of the deployment."""
     build_date: str = ""

@@ -40,8 +40,10 @@ class ColumnLoss:
     mass: float
     """Share of P(S, K) in cells with code 0: the probability that a reading selects code 0 on the true line."""
     kl_bits: float
-    """KL(Q(S | k) || P(S | k)) in bits, averaged over k: both are posteriors from this column alone, Q with its codes,
-    P exactly; all lines read the same k. (KL(P || Q) would be infinite if a tail became 0.)
+    """KL(Q(S | k) || P(S | k)) in bits, averaged over the reading k of this column.
+
+    P is the exact posterior from the column alone. Q is the posterior from the column's codes. All lines have the
+    reading k. The opposite divergence, KL(P || Q), would be infinite if a code of a tail became 0.
     """
     dead_values: int
     """Number of values with a probability above 0 that have code 0 on every line."""

@@ -76,7 +76,10 @@ def _period(machine: CheckedMachine, length: int) -> Iterator[Finding]:
 
 
 def _relations(machine: CheckedMachine) -> Iterator[Finding]:
-    """Find columns whose random bits are related by XOR, in a bank of seeds (with a generator per cell: in a line)."""
+    """Find columns whose random bits are related by XOR within a bank of seeds.
+
+    If each cell has a generator, find the relations within each line of a bank.
+    """
     parameters, names, about = machine.parameters, machine.names, f"rng = {machine.parameters.rng}"
     seeds = seed_words(machine.board).reshape(-1, parameters.columns)
     found, groups = relations(parameters.rng, seeds, parameters.prob_bits)

@@ -243,14 +243,15 @@ def load_deployment(
     """Read and check the deployment in a folder written by `toolchain build`.
 
     Without `images`, the images are not read or compared with their hashes, and NumPy is not imported. With `edited`,
-    a `deployment.toml` whose hash does not match its content is accepted. With `interrupted`, images and the filter's
-    file may differ from their hashes: an interrupted command has written them, but not yet `deployment.toml`.
+    `deployment.toml` may have a hash that does not match its content. With `interrupted`, images and the filter's file
+    may differ from their hashes in `deployment.toml`. An interrupted command leaves such files, because it writes
+    `deployment.toml` last.
 
     Raises:
         DeploymentError: The deployment is absent, not TOML, or has a wrong key or value.
         DeploymentVersionError: The deployment has another format.
-        DamagedDeploymentError: `deployment.toml` or an image has changed since the build; the sentence
-            contains the file and both hashes.
+        DamagedDeploymentError: `deployment.toml` or an image has changed since the build, or an image is absent.
+            The error names the file, and both hashes if it has changed.
     """
     directory = Path(directory)
     path = directory / FILE_NAME

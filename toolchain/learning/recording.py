@@ -1,8 +1,7 @@
 """Recorded readings with ground truth, as columns: from CSV files, MCAP files and bags.
 
-The columns of a CSV file are those of its header. Columns of a bag are TOPIC:PATH, such as `/scan:ranges[3]`;
-its rows are the messages on the topic of the first column, each with the nearest message in time on every
-other topic.
+The header of a CSV file names the columns. A column of a bag is TOPIC:PATH, such as `/scan:ranges[3]`. Each message
+on the topic of the first column is a row of the bag. On every other topic, the row takes the message nearest in time.
 """
 
 import csv
@@ -65,7 +64,10 @@ def read_recording(
 
 
 def reading_columns(names: Sequence[str], given: Sequence[str]) -> dict[str, str]:
-    """Return the column of each variable: its name, or that of a `PATTERN=COLUMN` in `given`.
+    """Return the name of the column of each variable.
+
+    Without `given`, the column has the variable's name. `given` contains `PATTERN=COLUMN` for variables whose names
+    match PATTERN. All other variables then have no column.
 
     Raises:
         BuildError: No variable matches a pattern.

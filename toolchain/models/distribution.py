@@ -1,7 +1,8 @@
-"""Joint distributions as in the library ProBT: symbols, and factors (tables, normals, functions, potentials).
+"""Joint distributions as in the library ProBT, made of symbols and factors.
 
-Continuous distributions become tables: the integral of a normal over the interval of each value of its symbol, or the
-value of a function.
+A factor is a table, a normal distribution, a function or a potential. Continuous distributions become tables. For a
+normal distribution, an entry of the table is the integral over the interval of a value of the symbol. For a function,
+an entry is the value of the function.
 """
 
 import math

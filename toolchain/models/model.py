@@ -74,7 +74,7 @@ class TabulatedVariable:
     step: float = 1.0
     """Difference between the readings of adjacent addresses, in the unit of the variable."""
     unit: str = ""
-    """The unit of its readings, such as m, which is shown next to them."""
+    """The unit of the variable's readings, such as `m`, for display."""
     period: int | None = None
     """The number of addresses after which the readings repeat (a turn of a bearing), or None."""
     on_range: Literal["error", "clamp", "missing"] = "error"

@@ -135,7 +135,10 @@ def only_emulated(deployment: Deployment) -> str:
 
 
 def quartus_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
-    """Return the Quartus project: `bm1.qpf`, a `.qsf` per board, `bm1.tcl`; nothing for a machine without hardware."""
+    """Return the files of the Quartus project: `bm1.qpf`, `bm1.tcl` and a `.qsf` per board.
+
+    A machine that exists only in emulation has no files.
+    """
     if only_emulated(deployment):
         return OutputFiles({}, _PROJECT)
     names = [memory.name for memory in memories(deployment, images)]

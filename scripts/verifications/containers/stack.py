@@ -40,11 +40,11 @@ def until(condition: Callable[[], object], otherwise: Callable[[], str], limit: 
 
 
 class Stack:
-    """The compose project, and docker commands for it.
+    """The compose project, with methods that run docker commands.
 
     Attributes:
         project: Folder of compose.yaml.
-        variables: Variables of compose.yaml that a check sets; `down` clears them.
+        variables: Variables of compose.yaml that a check sets. The method `down` clears the variables.
     """
 
     def __init__(self, project: Path) -> None:
@@ -108,7 +108,10 @@ class Stack:
         )
 
     def status(self) -> dict[str, Any]:
-        """Return what `status` shows; its exit code is not 0 while a process is not ready."""
+        """Return the output of the command `status --json`.
+
+        The exit code of the command is ignored, because it is not 0 while a process is not ready.
+        """
         output = self.docker("exec", self.container("master"), "status", "--json", check=False)
         status: dict[str, Any] = json.loads(output or "{}")
         return status

@@ -1,8 +1,8 @@
-"""Verification of the topics for robot tools with other projects' tools: Foxglove's readers, rviz (see scripts/verify).
+"""Verification of the topics for robot tools, with Foxglove's readers and with rviz (see scripts/verify).
 
 boat-simulator --> boat-normaliser --> hub <--> master with 4 boards
                                         |--JSON, cbor-raw--> Foxglove's client and readers, on Node (foxglove.mjs)
-                                        `--cbor-raw--> this --> a node of ROS 1 (ros_node.py) --> rviz on Xvfb
+                                        `--cbor-raw--> this script --> ROS 1 node (ros_node.py) --> rviz on Xvfb
 """
 
 import argparse
