@@ -99,7 +99,7 @@ def resources() -> dict[str, float]:
 
 
 def _listen(path: str) -> socket.socket:
-    """Listen at a path, even if a killed process has left a socket there; raise an OSError if another process listens."""
+    """Listen at a path, replacing a socket that a killed process left; raise an OSError if another process listens."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)  # a full backlog means that a process is listening
         if probe.connect_ex(path) == errno.ECONNREFUSED:

@@ -20,7 +20,7 @@ def new_figure(width: float, height: float) -> Any:
 
 
 def save_figure(figure: Any, path: Path, *, dpi: int = 130) -> None:
-    """Write a figure without matplotlib's version, so that the file changes only with the drawing, or raise an OutputError."""
+    """Write a figure without matplotlib's version: the file changes only with the drawing. May raise an OutputError."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=dpi, metadata={"Software": None} if path.suffix == ".png" else None)

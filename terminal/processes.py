@@ -147,7 +147,7 @@ def _run_command(
 
 
 def _show_command(name: str, words: Sequence[str]) -> None:
-    """Show a forked process in `top` by its name, and in `ps` by its command line, cut to the length of its parent's."""
+    """Show a forked process in `top` by its name, and in `ps` by its command line, cut to its parent's length."""
     ctypes.CDLL(None).prctl(_PR_SET_NAME, name.encode(), 0, 0, 0)
     start, end = map(int, Path("/proc/self/stat").read_text().rsplit(")", 1)[1].split()[45:47])
     size = end - start  # 0 where the system does not say

@@ -79,7 +79,7 @@ class Matched:
 
 
 def draw(path: Path, matched: Matched) -> None:
-    """Draw the left image, the truth, and the disparities of float64 fusion and of the machines, or raise an OutputError."""
+    """Draw the left image, the truth, and the disparities of float64 and of the machines; may raise an OutputError."""
     figure = new_figure(8, 5.6)
     panels = figure.subplots(2, 2).ravel()
     panels[0].imshow(matched.left, cmap="gray", vmin=0, vmax=255)

@@ -124,7 +124,7 @@ class ImagePairs:
         self._waiting: tuple[dict[int, Mapping[str, Any]], ...] = ({}, {})
 
     def add(self, side: int, message: Mapping[str, Any]) -> StereoImages | None:
-        """Add an image of the left (0) or right (1) camera; return the pair that it completes, or raise a BadImageError.
+        """Add an image of camera 0 (left) or 1 (right); return the pair that it completes, or raise a BadImageError.
 
         A pair discards the older images of both cameras; newer images of one camera wait for those of the other.
         """

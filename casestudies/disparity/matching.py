@@ -58,9 +58,9 @@ def filtered(image: NDArray[np.uint8]) -> NDArray[np.float32]:
 def matching_costs(
     left: NDArray[np.uint8], right: NDArray[np.uint8], disparities: int
 ) -> NDArray[np.float32]:
-    """Return the cost of each filter, disparity and pixel of the left image, float32[filters, disparities, height, width].
+    """Return costs of the left image: float32[filters, disparities, height, width].
 
-    It is the mean of |left(x, y) - right(x - d, y)| over a window. Where x - d lies beyond the border, it is NaN.
+    A cost is the mean of |left(x, y) - right(x - d, y)| over a window. Where x - d lies beyond the border, it is NaN.
     """
     ours, theirs = filtered(left), filtered(right)
     height, width = left.shape

@@ -1,4 +1,4 @@
-"""The model of a pixel's disparity, P(d) P(k1 | d) P(k2 | d) P(k3 | d), and the topics of the case study (thesis 4.4)."""
+"""The model of a pixel's disparity, P(d) P(k1 | d) P(k2 | d) P(k3 | d), and the case study's topics (thesis 4.4)."""
 
 from typing import Final
 

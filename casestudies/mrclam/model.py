@@ -34,7 +34,7 @@ class Landmark:
 
 
 def read_landmarks(path: Path) -> tuple[Landmark, ...]:
-    """Return the landmarks of a CSV file with the columns landmark, x_m and y_m, in the file's order, or raise a ModelError."""
+    """Return the landmarks in a CSV file (landmark, x_m, y_m), in the file's order, or raise a ModelError."""
     columns = read_recording(Path(path), ("landmark", "x_m", "y_m")).columns
     found: dict[int, Landmark] = {}
     for row, values in enumerate(zip(*columns.values(), strict=True), start=1):

@@ -1,4 +1,4 @@
-"""Accounts of readings: each reading that reached the stack has a result, or is counted under a reason that a fault explains."""
+"""Accounts of readings: each that reached the stack has a result, or is counted under the reason of a fault."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""The main function of a script: its coroutine within a time limit, an error in one sentence, and a table of results."""
+"""The main function of a script: a coroutine within a time limit, errors in one sentence, and tables of results."""
 
 import asyncio
 import sys

@@ -31,7 +31,7 @@ def main() -> int:
         kinds.append(("thorough tests", ("-m", "thorough", "-n", "2", "--dist", "worksteal")))
     failed: list[str] = []
     once: list[str] = []
-    """Tests with processes that failed once; they run again, because a disturbance by another program does not recur."""
+    """Tests with processes that failed once; they run again, because a disturbance by other programs does not recur."""
     for name, flags in kinds:
         print(f"-- {name}", flush=True)
         code, names = pytest(*flags, "--durations", "10")

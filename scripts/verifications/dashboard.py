@@ -98,7 +98,7 @@ class Scene:
                 self.news.notify_all()
 
     async def until(self, condition: Callable[[], bool], what: str) -> None:
-        """Wait until a condition on the received messages holds, or raise a CheckError that says what did not happen."""
+        """Wait until a condition on the received messages holds, or raise a CheckError that names the condition."""
         async with within(PATIENCE, what), self.news:
             await self.news.wait_for(condition)
 

@@ -1,4 +1,4 @@
-"""Installation of other software for verifications: packages of PyPI and npm, pinned by hash, and programs of Debian."""
+"""Installation of other software for verifications: packages of PyPI and npm, pinned by hash, and Debian's programs."""
 
 import fcntl
 import hashlib
@@ -74,7 +74,7 @@ def use_packages(name: str, lock: Path) -> Path:
 
 
 def install_roslibpy() -> Path:
-    """Return the folder with roslibpy's environment (venv) and its source package (source), after installing them once."""
+    """Return the folder with roslibpy's environment (venv) and source (source); install them at the first call."""
 
     def make(folder: Path) -> None:
         run(sys.executable, "-m", "venv", folder / "venv")

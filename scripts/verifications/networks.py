@@ -83,7 +83,7 @@ def load(pyagrum: Any, path: Path) -> Any:
 
 
 def array_of(table: Any, order: list[str]) -> NDArray[np.float64]:
-    """Return a table of pyagrum as an array with the axes in this order; pyagrum's own axes are in reverse order of its names."""
+    """Return a table of pyagrum as an array with the axes in the given order; pyagrum's own order is the reverse."""
     names = list(reversed(table.names))
     found: NDArray[np.float64] = np.transpose(table.toarray(), [names.index(name) for name in order])
     return found

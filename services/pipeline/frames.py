@@ -44,7 +44,7 @@ class _SourceReader:
         )
 
     def read(self, message: dict[str, Any]) -> tuple[Addresses, Values, bytes]:
-        """Return a message's addresses, values and prior codes; a VariableError if a variable is missing or unusable."""
+        """Return a message's addresses, values and prior codes; raise a VariableError if a variable is unusable."""
         addresses: Addresses = []
         values: Values = []
         try:

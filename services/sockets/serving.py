@@ -197,7 +197,7 @@ class MasterLink(Link):
         self.send(record)
 
     def notice(self, level: str, sentence: str) -> None:
-        """Send a message for the user, or store it for the next master, because a service may start before its master."""
+        """Send a message for the user, or store it for the next master: a service may start before its master."""
         if not self.send(record := Notice(level, sentence)):
             self._unsaid.append(record)
 

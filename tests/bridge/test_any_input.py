@@ -230,7 +230,7 @@ class PaperServer:
 
 
 class AnyServer(RuleBasedStateMachine):
-    """Check that errors are the bridge's, memory is bounded, output is strict JSON, and the server knows what is wanted."""
+    """Check that errors are the bridge's, memory is bounded, output is strict JSON, and the server knows the wishes."""
 
     def __init__(self):
         super().__init__()

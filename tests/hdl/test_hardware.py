@@ -1,4 +1,4 @@
-"""The VHDL in short: sessions of two machines, units, a proof, datasheets and logic; scripts/verify hdl has all of them."""
+"""The VHDL in short: sessions of two machines, units, a proof, datasheets and logic; scripts/verify hdl has all."""
 
 import json
 import shutil

@@ -394,7 +394,7 @@ async def until_rosapi(uri, question, is_wanted, **args):
 
 
 def inferred(folder, rows, where):
-    """The posteriors that `toolchain infer` computes for readings: a row for each frame, in the order of the variables."""
+    """The posteriors that `toolchain infer` computes for readings, a row per frame, in the order of the variables."""
     names = [variable.name for variable in load_deployment(folder).variables]
     lines = [",".join("" if value is None else str(value) for value in row) for row in [names, *rows]]
     (where / "recording.csv").write_text("\n".join(lines) + "\n")

@@ -1,4 +1,4 @@
-"""Command lines: mistakes are one sentence and exit code 2, and every end has its exit code: signals, full disks, bugs."""
+"""Command lines: a mistake is a sentence and exit code 2, and every end has its code: signals, full disks, bugs."""
 
 import importlib
 import os

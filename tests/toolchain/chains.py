@@ -21,7 +21,7 @@ def sprinkler(searched=("rain",), known=("grass",)):
 
 
 def network(tables, *, searched=("A",), known=(), on_missing="error"):
-    """A network of potentials by their scopes, such as {"AB": [[1, 2], [3, 4]]}; its variables are in the order of these."""
+    """A network of potentials by their scopes, such as {"AB": [[1, 2], [3, 4]]}, with the variables in their order."""
     arrays = {scope: np.asarray(each, dtype=float) for scope, each in tables.items()}
     sizes = {
         name: size for scope, each in arrays.items() for name, size in zip(scope, each.shape, strict=True)

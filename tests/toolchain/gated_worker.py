@@ -1,7 +1,7 @@
 """Preloaded by a dask worker: later pieces of its jobs wait for a file, so that a test can kill somebody in the middle.
 
-In the worker's folder: `computed` has the number of each piece that was computed, `waiting.PID` says that this worker waits, and
-`go` lets all pieces pass.
+In the worker's folder: `computed` has the number of each piece that was computed, `waiting.PID` says that this worker
+waits, and `go` lets all pieces pass.
 """
 
 import os

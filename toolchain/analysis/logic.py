@@ -72,7 +72,7 @@ class Of(StrEnum):
     """The kinds of units in which a machine's logic is counted, each with the VHDL that one unit stands for."""
 
     BOARD = "board"
-    """The units that each board has once: bm1_axi, bm_register_block, bm1_guard, and bm1_control of a single machine."""
+    """The units that each board has once: bm1_axi, bm_register_block, bm1_guard, and one machine's bm1_control."""
     CODE_BIT = "code bit"
     """A bit of a cell's code, in bm1_stochastic_bitstream_generator.
 

@@ -108,7 +108,7 @@ def check(
     """Report mistakes before anything runs: in a model as it would be built, or in a deployment.
 
     For example `toolchain check casestudies/boat --partitions 4`, or `toolchain check build/boat`. It takes all options
-    of `toolchain build`, and needs none of them. The exit code is 2 if there is an error among the findings, otherwise 0.
+    of `toolchain build`, and needs none of them. The exit code is 2 if an error is among the findings, otherwise 0.
     """
     del directory  # accepted, so that a `build` command becomes a check by changing only its first word
     from toolchain.checks.check import check_deployment

@@ -107,7 +107,7 @@ class NetworkBuilder:
     def distribution(
         self, child: str, parents: Sequence[str], values: NDArray[np.float64], place: Place
     ) -> None:
-        """Add P(child | parents), float64[child's states, each parent's]; normalise sums that are 1 within `ROUNDING`."""
+        """Add P(child | parents), float64[child's states, each parent's]; normalise sums within `ROUNDING` of 1."""
         if child in self._children:
             raise place.error(f"{child} has two tables")
         self._children.add(child)

@@ -88,7 +88,7 @@ def check_stop(stack: Stack) -> None:
 
 
 def check_confined(stack: Stack) -> None:
-    """Check that containers do not run as root, and have no capabilities, writable files, external network or open ports."""
+    """Check that containers have no root, capabilities, writable files, external network or open ports."""
     output = stack.docker("exec", stack.container("master"), "cat", "/proc/self/status")
     fields = dict(line.split(":\t", 1) for line in output.splitlines() if ":\t" in line)
     expect(fields["Uid"].split() == ["10001"] * 4, f"it runs as {fields['Uid']}")
@@ -127,7 +127,7 @@ def check_status(stack: Stack) -> None:
 
 
 def check_silent_board(stack: Stack) -> None:
-    """Suspend the process of a board, so that it is silent as without power, and resume it; suspend it again and kill it."""
+    """Suspend a board's process, so that it is silent as without power, and resume it; suspend it again and kill it."""
 
     def silent(then: str) -> None:
         until(lambda: "board2" in stack.processes(), lambda: "status does not show board2")
@@ -146,7 +146,7 @@ def check_silent_board(stack: Stack) -> None:
 
 
 def check_lost_network(stack: Stack) -> None:
-    """Disconnect the network of subscriber and publisher while connections are open, as when a robot drives out of range."""
+    """Disconnect the network of subscriber and publisher during connections, as when a robot drives out of range."""
     lost = ("subscriber", "publisher")
     for service in lost:
         stack.docker("network", "disconnect", "rosbayes_ros", stack.container(service))

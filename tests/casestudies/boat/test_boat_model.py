@@ -1,4 +1,4 @@
-"""The boat: its map, its tables (boat.md, thesis 2.1.2.1), its simulator, and the whole numbers that its readings become."""
+"""The boat: its map, its tables (boat.md, thesis 2.1.2.1), its simulator, and the whole numbers of its readings."""
 
 import math
 import statistics

@@ -1,4 +1,4 @@
-"""The host's part of binocular disparity against loops over pixels, and one tile on the machine against the reference."""
+"""The host's part of binocular disparity against loops over pixels, and a tile on the machine against the reference."""
 
 import base64
 import dataclasses

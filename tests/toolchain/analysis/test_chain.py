@@ -91,7 +91,7 @@ def test_a_frame_forgets_its_start():
 
 
 def test_samples_of_a_persistent_variable_are_worth_less():
-    """Of two equal variables, the sweep's matrix is known: a variable keeps its value but for a share of 2 q (1 - q)."""
+    """The sweep's matrix of two equal variables is known: a variable changes its value in a share of 2 q (1 - q)."""
     keep = 0.9
     machine = machine_of(network({"AB": [[keep, 1 - keep], [1 - keep, keep]]}))
     chain = ExactChain(machine, {})

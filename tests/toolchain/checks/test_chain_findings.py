@@ -1,4 +1,4 @@
-"""Every finding about a BM2: clipped factors, errors of the codes, states without a path, wide factors, random numbers."""
+"""Findings about a BM2: clipped factors, errors of the codes, states without a path, wide factors, random numbers."""
 
 import itertools
 import math

@@ -1,4 +1,4 @@
-"""The network of a question for a BM2: its factors, variables and exact posterior, and the questions that are refused."""
+"""The network of a question for a BM2: its factors, variables and exact posterior, and the refused questions."""
 
 import math
 

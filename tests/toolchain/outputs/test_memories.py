@@ -1,4 +1,4 @@
-"""MIFs in every form, every memory of a machine as one, the parameters as a VHDL package, and the project of Quartus."""
+"""MIFs in every form, every memory of a machine as one, the parameters as a VHDL package, and Quartus's project."""
 
 import os
 import re
