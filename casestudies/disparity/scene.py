@@ -34,7 +34,7 @@ class Pair:
     """uint8[height, width]: grey levels."""
     right: NDArray[np.uint8]
     disparity: Array
-    """float64[height, width]: true disparity, the number of pixels by which a point is further left in the right image."""
+    """float64[height, width]: true disparity, the pixels by which a point is further left in the right image."""
     occluded: NDArray[np.bool_]
     """bool[height, width]: pixels whose point is hidden from the right camera, or outside its image."""
 

@@ -83,7 +83,7 @@ class Board(Protocol):
         """Run the machine for one more chunk; then `running` tells whether it must continue."""
 
     def interrupt_words(self) -> bytes:
-        """Return an interrupt's payload: the registers from DONE to COMPUTE_NS, then results, if the board sends them."""
+        """Return an interrupt's payload: the registers from DONE to COMPUTE_NS, then results if the board sends any."""
 
     def release(self) -> None:
         """Stop a running machine and disable interrupts, because the host has disconnected."""

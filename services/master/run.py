@@ -82,7 +82,7 @@ class Master:
         self._tasks: list[asyncio.Task[None]] = []
 
     async def run(self) -> int:
-        """Start missing peers, move frames, and stop the started peers; raise a StackError after an error of the run."""
+        """Start missing peers, move frames, and stop the started peers; raise a StackError for an error of the run."""
         settings, peers = self._settings, self._peers
         sockets = contextlib.AsyncExitStack()
         try:

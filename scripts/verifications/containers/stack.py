@@ -157,7 +157,7 @@ class Stack:
 
     @contextlib.contextmanager
     def cleared(self, **variables: str) -> Iterator[None]:
-        """Remove the project and set variables; after the block, remove it again. If the block failed, save the logs."""
+        """Remove the project and set variables; after the block, remove it again; if it failed, save the logs."""
         self.down()
         self.variables |= variables
         try:
