@@ -23,7 +23,10 @@ _CACHED_TYPES = 1024
 # Cached, because the few types of a robot are compared often.
 @lru_cache(maxsize=_CACHED_TYPES)
 def split_type(name: str) -> tuple[str, str, str]:
-    """Return the package, kind (`msg`, `srv`, `action`, or empty in the ROS 1 form) and name of a type."""
+    """Return the package, the kind and the name of a type.
+
+    The kind is `msg`, `srv` or `action`. It is empty if `name` has the ROS 1 form, `package/Type`.
+    """
     match = _TYPE.fullmatch(name) if len(name) <= MAX_NAME else None
     if match is None:
         raise NameFormError(

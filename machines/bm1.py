@@ -45,11 +45,11 @@ class BM1Machine(MachineContents):
 
     Attributes:
         parameters: Sizes, widths and generators.
-        prior: uint16[2**prior_bits, lines], the codes of the prior; for a written prior, row 0 applies until
-            the host writes one.
-        tables: One uint16[2**sensor_bits, lines] per sensor column; the top row has all-ones codes (a missing
-            reading). Empty if `sensor_mode` is `threshold`.
-        rng_table: uint32[length], the random numbers for all columns if `rng` is `table`; otherwise None.
+        prior: uint16[2**prior_bits, lines], the codes of the prior. If `prior_mode` is `written`, row 0 applies
+            until the host writes a prior.
+        tables: One uint16[2**sensor_bits, lines] per sensor column. The top row stands for a missing reading, and
+            its codes are all ones. Empty if `sensor_mode` is `threshold`.
+        rng_table: uint32[length], the random numbers for all columns, or None if `rng` is not `table`.
 
     Raises:
         ParameterError: The arrays do not match the parameters.

@@ -66,15 +66,16 @@ class FrameSettings(NamedTuple):
 
 
 class BoardResult(msgspec.Struct, frozen=True, array_like=True, tag="board"):
-    """The result of a board; its MessagePack form is part of a record between the services.
+    """The result of a board. Records between the services contain this result as MessagePack.
 
     Attributes:
-        words: The result words, 32 bits each, little-endian, as received; replica after replica.
-        cycles: Cycles of the board's machine; with replicas, of the longest-running one.
-        reason: Stop reason, a key of `MachineKind.reasons`; with replicas, their `joint_reason`.
-        replica_cycles: Cycles of each replica; empty if the board has a single machine.
-        replica_reasons: Stop reason of each replica; empty if the board has a single machine.
-        kept: Further results that `FrameCourse.conclude` adds for `MachineKind.infer`, encoded as the kind chooses.
+        words: The result words of all replicas, one replica after another. A word has 32 bits, little-endian.
+        cycles: Cycles of the board's machine. With replicas, the cycles of the replica that ran longest.
+        reason: Stop reason, a key of `MachineKind.reasons`. With replicas, the replicas' `joint_reason`.
+        replica_cycles: Cycles of each replica. Empty if the board has a single machine.
+        replica_reasons: Stop reason of each replica. Empty if the board has a single machine.
+        kept: Further results that `FrameCourse.conclude` adds for `MachineKind.infer`. Each kind of machine
+            chooses the encoding.
     """
 
     words: bytes

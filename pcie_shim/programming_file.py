@@ -229,7 +229,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def image_from_bytes(content: bytes, name: str = "the image") -> Image:
-    """Decode the image in the bytes of a programming file, and check all hashes; `name` is its name in errors.
+    """Decode the image in the bytes of a programming file, and check all hashes. Errors call the file `name`.
 
     Raises:
         DamagedImageError: A hash is wrong.

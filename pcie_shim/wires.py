@@ -12,8 +12,8 @@ class LinkFigures:
 
     Attributes:
         mbps: Rate in 10^6 bits per second.
-        latency_us: Microseconds of a transfer in one direction, in addition to the time for its bits.
-        shared: True if one wire connects all boards, so that their transfers queue.
+        latency_us: Latency of a transfer in one direction in microseconds, without the time for the bits.
+        shared: True if one wire connects all boards. Only one board can then transfer at a time.
     """
 
     mbps: float

@@ -59,8 +59,8 @@ class Ros:
         """Close the connection after all published messages, and end everything that waits.
 
         Some servers drop unread messages when a client disconnects. If this client has published, it therefore
-        makes a call before it disconnects, and waits for the answer, which follows all its messages, for at most
-        0.3 s.
+        calls a service of rosapi before it disconnects. The server answers after it has read all earlier messages.
+        The client waits for the answer for at most 0.3 s.
         """
         try:
             if self._publishes and self._session.state is State.CONNECTED:
@@ -322,17 +322,18 @@ class Ros:
 
         Args:
             action: Name of the action.
-            type: Its type, such as `example_interfaces/action/Fibonacci` or `example_interfaces/Fibonacci`.
-            handler: Coroutine function that is called with each goal, and executes it. It may send feedback,
-                and should check whether the goal has been cancelled. The fields that it returns become the
-                result: the goal succeeds, or counts as cancelled if the sender asked for that, unless the
-                handler has already ended it. If the handler raises an error, or a result or feedback does not
-                fit the type, the goal is aborted, and the error is logged. Up to 64 goals are executed
-                concurrently. Handlers are cancelled when the connection is lost.
+            type: Type of the action: `example_interfaces/action/Fibonacci` or `example_interfaces/Fibonacci`.
+            handler: Coroutine function that executes a goal. The client calls the handler with each goal, up to 64
+                goals concurrently. The handler may send feedback, and should check whether the goal has been
+                cancelled. The returned fields become the goal's result, unless the handler has already ended
+                the goal. The goal then counts as cancelled if the sender asked for that, and otherwise as
+                succeeded. If the handler raises an error, the goal is aborted, and the error is logged. A
+                result or feedback that does not fit the type is such an error. Handlers are cancelled when the
+                connection is lost.
 
         Raises:
             NameFormError: The name or the type is malformed.
-            ActionlibError: The server is one of ROS 1, whose actions are topics.
+            ActionlibError: The server is a ROS 1 server. Actions of ROS 1 are topics.
             TypeConflictError: This client already serves this action.
             DisconnectedError: The client was closed.
         """

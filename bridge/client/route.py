@@ -38,10 +38,10 @@ def shown(uri: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Route:
-    """Settings of a connection to a server that are not in its URI.
+    """Settings of a connection that are not in the server's URI.
 
     Attributes:
-        tls: TLS settings; None for `ws://`.
+        tls: TLS settings, or None for `ws://`.
         headers: Additional headers of the handshake.
     """
 

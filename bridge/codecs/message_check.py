@@ -68,7 +68,10 @@ def definitions_from_rosapi(answer: Any) -> Definitions:
 
 
 def bundled_definitions(type_name: str, ros_version: int) -> Definitions:
-    """Return the definitions of a type and the types nested in it from rosbags; empty if unknown or without rosbags."""
+    """Return the definitions of a type, and of all types nested in it, as rosbags contains them.
+
+    The result is empty if rosbags is not installed or does not know the type.
+    """
     try:
         from rosbags.typesys import Stores, get_typestore
     except ImportError:

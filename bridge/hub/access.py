@@ -106,10 +106,10 @@ def _presented(request: Request) -> list[str]:
 
 
 def read_tokens(path: Path) -> tuple[str, ...]:
-    """Read a file of tokens, one per line; empty lines and lines that begin with # are ignored.
+    """Read a file of tokens, one per line. Empty lines and lines that begin with # are ignored.
 
     Raises:
-        HubError: The file cannot be read, can be read by other users, or has no tokens.
+        HubError: The file cannot be read, is readable by other users, or has no tokens or more than 1000.
     """
     try:
         mode = path.stat().st_mode

@@ -1,15 +1,16 @@
-"""Absent fields of a message, filled with their defaults, so that every subscriber sees the whole message.
+"""Absent fields of a message, filled with default values, so that every subscriber receives all fields.
 
-The reference server builds a ROS message from the JSON and forwards that (`_to_object_inst` in
-rosbridge_library/internal/message_conversion.py): an absent field has the message's default, and the stamp of a
-`std_msgs/Header` without one is the time of receipt. An absent header gets the same stamp, as the specification
-says (ROSBRIDGE_PROTOCOL.md, 3.3.3). Unlike the reference server, the hub does not check present values.
+The reference server builds a ROS message from the JSON, and forwards the ROS message. Its code is `_to_object_inst` in
+rosbridge_library/internal/message_conversion.py. An absent field has the default value of the ROS message. The absent
+stamp of a `std_msgs/Header` is the time of receipt. If the whole header is absent, its stamp is the time of receipt
+too, as the specification says (ROSBRIDGE_PROTOCOL.md, 3.3.3). Unlike the reference server, the hub does not check
+present values.
 
     {"op":"publish","topic":"/t","msg":{"data":[1.5]}}                                     as received
     {"op":"publish","topic":"/t","msg":{"data":[1.5],"layout":{"dim":[],"data_offset":0}}} as forwarded
 
-Most messages lack only outermost fields. Such a message keeps its own JSON: the JSON of the absent fields, its *tail*,
-replaces the last two braces. Only a message in which a nested message lacks fields is written again.
+Most messages lack only outermost fields. The hub then replaces the last two braces of the publisher's JSON with the
+*tail*, the JSON of the absent fields. If a nested message lacks fields, the hub encodes the whole message again.
 """
 
 from collections.abc import Callable

@@ -97,9 +97,9 @@ class Rosapi:
         return service.startswith(PREFIX) and service.removeprefix(PREFIX) in self._services
 
     def call(self, service: str, args: object) -> Values:
-        """Answer one call of a service for which `offers` returned true, and return the answer's `values`.
+        """Answer a call of a service for which `offers` has returned true. Return the `values` of the answer.
 
-        `args` is an object, or a list in the order of the service's fields; an omitted field is an empty
+        `args` is an object, or a list in the order of the service's fields. An omitted field counts as an empty
         string, as in ROS.
 
         Raises:

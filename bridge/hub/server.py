@@ -83,17 +83,18 @@ async def serve_hub(
     on_graph: Callable[[Graph], None] | None = None,
     stop: asyncio.Event,
 ) -> None:
-    """Serve rosbridge until `stop` is set, then close every connection (1001) and return.
+    """Serve rosbridge until `stop` is set, then close every connection with code 1001 and return.
 
     Args:
-        host: the address to listen on. Without tokens and TLS give a loopback address, unless everybody who
-            can reach the address may publish to your robot.
-        port: the port to listen on; 0 for any free one.
+        host: the address to listen on. Without tokens and TLS, everybody who can reach this address may publish
+            to your robot. A loopback address is reachable only from this machine.
+        port: the port to listen on, or 0 for any free port.
         limits: bounds on clients and messages.
-        access: access control and TLS; by default every program may connect, and web pages of this machine.
+        access: access control and TLS. By default, every program and the web pages of this machine may connect.
         ros_version: the ROS version that the hub emulates.
         on_ready: called with the port once clients can connect.
-        on_graph: called before `on_ready` with the graph of clients and topics, which it may read but not change.
+        on_graph: called before `on_ready` with the graph of clients and topics. The function may read the graph,
+            but not change it.
         stop: event that ends the hub.
 
     Raises:

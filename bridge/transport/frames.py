@@ -49,12 +49,12 @@ def whole_messages(
     Args:
         data: bytes from the socket.
         at: index in `data` at which a frame begins.
-        masked: whether the peer is a client, which masks its frames.
-        largest: maximum size of a message in bytes; reading stops at a larger one.
+        masked: whether the peer is a client. Clients mask their frames.
+        largest: maximum size of a message in bytes. Reading stops at a larger message.
         count: maximum number of messages to read.
 
     Returns:
-        The payloads, and the index at which the reading ended; `frame_end` examines the frame there.
+        The payloads, and the index at which the reading ended. `frame_end` can examine the frame at this index.
     """
     found: list[bytes] = []
     take, unmask = found.append, apply_mask
@@ -111,9 +111,9 @@ def frame_end(data: bytes, at: int, *, masked: bool, largest: int) -> int:
     """Find the end of the frame that begins at `at`.
 
     Returns:
-        The end, which is beyond `data` while the frame is incomplete; `UNKNOWN` while its header is
-        incomplete; `UNSOUND` if it is invalid or has more than `largest` bytes, so that `websockets` must
-        handle it at once.
+        The index after the frame. If the frame is incomplete, this index is beyond `data`. The result is `UNKNOWN`
+        if the frame's header is incomplete. The result is `UNSOUND` if the frame is invalid, or if its payload has
+        more than `largest` bytes. `websockets` must handle an unsound frame at once.
     """
     size = len(data)
     if size < at + 2:

@@ -1,4 +1,4 @@
-"""The matcher: it reads stereo pairs, sends their likelihoods to the boards in tiles, and publishes disparity images.
+"""The matcher, which computes disparity images from stereo pairs with the boards.
 
 left and right image ─▶ filters, matching costs ─▶ tiles of likelihoods ─▶ stack, boards
 disparity image ◀── most probable disparities ◀── posteriors of a tile ◀── /bm/frame, /BMresults
@@ -139,11 +139,11 @@ class Stack:
 
 
 class Matcher:
-    """The received stereo images, and their disparities as the machines compute them.
+    """Received stereo images, and the disparities that the machines compute from the images.
 
     Attributes:
-        matched: The newest pair with its posteriors, for the picture; None before the first.
-        pairs: Number of pairs matched.
+        matched: The newest pair with its posteriors, for the picture. None before the first pair.
+        pairs: Number of matched pairs.
     """
 
     def __init__(self, *, disparities: int, pixels: int, clock: float) -> None:

@@ -36,7 +36,7 @@ class Pair:
     disparity: Array
     """float64[height, width]: true disparity, the pixels by which a point is further left in the right image."""
     occluded: NDArray[np.bool_]
-    """bool[height, width]: pixels whose point is hidden from the right camera, or outside its image."""
+    """bool[height, width]: true for a pixel whose point is hidden from the right camera or outside the right image."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +45,10 @@ class _Sphere:
     radius: float
 
     def distance(self, origin: Array, rays: Array) -> Array:
-        """Return where each ray, float64[pixels, 3], first hits the sphere, in ray lengths; infinite for a miss."""
+        """Return the distance at which each ray first hits the sphere, float64[pixels], in lengths of the ray.
+
+        `rays` is float64[pixels, 3]. The distance is infinite if a ray misses the sphere.
+        """
         away = origin - self.centre
         a, b = (rays**2).sum(axis=1), rays @ away
         root = b**2 - a * (away @ away - self.radius**2)
@@ -59,7 +62,10 @@ class _Box:
     high: Array
 
     def distance(self, origin: Array, rays: Array) -> Array:
-        """Return where each ray, float64[pixels, 3], enters the box, in ray lengths; infinite for a miss."""
+        """Return the distance at which each ray enters the box, float64[pixels], in lengths of the ray.
+
+        `rays` is float64[pixels, 3]. The distance is infinite if a ray misses the box.
+        """
         with np.errstate(divide="ignore"):
             first, second = (self.low - origin) / rays, (self.high - origin) / rays
         enters = np.minimum(first, second).max(axis=1)

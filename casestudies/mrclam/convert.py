@@ -108,7 +108,10 @@ def read_columns(path: Path, names: Sequence[str]) -> Iterator[tuple[str, tuple[
 
 
 def read_barcodes(folder: Path) -> dict[int, int]:
-    """Return the subject of each barcode (1 to 5: robots, 6 to 20: landmarks), or raise a ModelError."""
+    """Return the subject of each barcode, or raise a ModelError.
+
+    The subjects 1 to 5 are robots, and the subjects 6 to 20 are landmarks.
+    """
     subjects: dict[int, int] = {}
     for where, (subject, barcode) in read_columns(folder / "Barcodes.dat", ("subject", "barcode")):
         if subject not in _SUBJECTS or barcode != int(barcode):

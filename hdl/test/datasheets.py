@@ -135,10 +135,10 @@ def generated_part(unit: Unit) -> str:
 
 
 def page(unit: Unit) -> str:
-    """Return a unit's page: its generated part, and the theory of operation that it already has.
+    """Return a unit's page: the generated part, then the theory of operation from the page's file.
 
     Raises:
-        ValueError: The page has no theory of operation.
+        ValueError: The file has no theory of operation.
     """
     path = PAGES / f"{unit.name}.md"
     _, heading, theory = (path.read_text() if path.is_file() else "").partition(THEORY)

@@ -82,7 +82,7 @@ def synthesised(image: Image, folder: Path) -> Netlist:
 
 
 def run_yosys(script: str, folder: Path) -> str:
-    """Run the version of yosys that the lock file pins, and return its output.
+    """Run a script of yosys in a folder, and return what yosys prints. The lock file pins the version of yosys.
 
     Raises:
         HardwareToolError: yosys failed.

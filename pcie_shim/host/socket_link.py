@@ -1,17 +1,18 @@
 """The link to a board over a blocking socket (AF_UNIX or TCP): frames with sequence numbers and CRCs.
 
     host                                              board
-      │◀─ GREET: map, image, token ─────────────────────│   before it AUTHENTICATE, if there is a key
+      │◀─ GREET: map, image, token ─────────────────────│   after AUTHENTICATE, if there is a key
       │── READ 1 ──────────────────────────────────────▶│
       │◀─ reply 1 ──────────────────────────────────────│
       │── WRITE 2, POSTED: settings and sensors ───────▶│   no reply
       │── WRITE 3, POSTED: RUN_UNTIL and the doorbell ─▶│
-      │◀─ IRQ 1: DONE, STATUS, CYCLES, COMPUTE_NS ──────│   numbered apart from the requests; results may follow
+      │◀─ IRQ 1: DONE, STATUS, CYCLES, COMPUTE_NS ──────│   IRQs have their own numbers; results may follow
       │◀─ ERROR 3 ──────────────────────────────────────│   instead of the IRQ, if write 3 was refused
 
-A host with one board reads, writes and waits. A host with many boards posts to each of them, polls their
-descriptors and receives what has arrived. Every method may raise a `LinkError`: an `AccessError` if the
-board refused the access (the link stays open), or another one if the link is broken (it is closed).
+A host with one board reads, writes and waits. A host with many boards posts to each board, polls the
+descriptors of all links, and receives the frames that have arrived. Every method may raise a `LinkError`.
+If the board refused an access, the error is an `AccessError`, and the link stays open. After any other
+`LinkError`, the link is broken and closed.
 """
 
 import hmac
@@ -136,10 +137,10 @@ class SocketLink:
             self._give_up(error)
 
     def _authenticate(self, frame: Frame, deadline: float, connect_timeout: float) -> Frame:
-        """Prove that this host has the key, check that the board has it, and return the board's greeting.
+        """If there is a key, check that host and board have the same key. Return the board's greeting.
 
         Raises:
-            KeyRefusedError: The keys differ.
+            KeyRefusedError: The keys differ, or only the host or only the board has a key.
         """
         key = self.endpoint.key
         if frame.operation != framing.AUTHENTICATE:

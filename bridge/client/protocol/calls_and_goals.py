@@ -36,7 +36,7 @@ MAX_GOALS: Final = 100
 MAX_REQUESTS: Final = 64
 """Maximum number of requests to services of this client that wait for its answer; further ones are refused."""
 MAX_SERVED_GOALS: Final = 64
-"""Maximum number of goals that this client executes at the same time; further ones are aborted."""
+"""Maximum number of goals that this client executes at the same time. The client aborts further goals."""
 
 
 # What this client asks for
@@ -276,10 +276,10 @@ class ServedActions(_Served):
             self._wire.write(op="action_feedback", id=goal, action=action, values=values)
 
     def end(self, goal: str, status: GoalStatus, values: Mapping[str, Any] | str) -> None:
-        """End a goal with its result, or with the text of a failure.
+        """End a goal with a result, or with a text that describes a failure.
 
         Raises:
-            EncodeError: The values cannot be encoded as JSON; the goal has not ended.
+            EncodeError: The values cannot be encoded as JSON. The goal has then not ended.
         """
         action = self._goals.get(goal)
         if action is not None:

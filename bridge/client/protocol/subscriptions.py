@@ -197,10 +197,10 @@ class Subscriptions:
         return number
 
     def leave_out(self, topic: str | None) -> tuple[int, ...]:
-        """Do not subscribe to a topic again, because each of its messages would end the connection.
+        """Do not subscribe to a topic again, because each message on the topic would end the connection.
 
         Returns:
-            The numbers of its subscriptions (as from `subscribe`); empty if there are none.
+            The numbers that `subscribe` has returned for this topic, or () if the topic has no subscription.
         """
         subscribed = None if topic is None else self._subscribed.get(absolute(topic))
         if subscribed is None:
@@ -255,9 +255,12 @@ class Subscriptions:
         self._wire.write(op="unsubscribe", id=subscribed.wire_id, topic=subscribed.topic)
 
     def retry_untyped(self) -> bool:
-        """Repeat each subscription that names no type and has had no message yet; return whether there is any.
+        """Repeat each subscription that names no type and has had no message yet.
 
-        Servers drop such a subscription if they do not know the topic yet, most of them silently.
+        If a server does not know the topic yet, it drops a subscription without a type. Most servers report nothing.
+
+        Returns:
+            True if at least one subscription was repeated.
         """
         waiting = [
             s for s in self._subscribed.values() if s.type is None and not s.has_messages and not s.left_out
