@@ -40,9 +40,9 @@ class CommandLine(typer.Typer):
         return super().command(name, cls=cls or _Command, **settings)
 
     def add_later(self, name: str, module: str, *, purpose: str) -> None:
-        """Add the command line `app` of a module as a subcommand; it is imported when the subcommand is named.
+        """Add a subcommand whose module is imported only when a user names the subcommand.
 
-        If that command line is a group, `MODULE:NAME` adds one of its commands.
+        The subcommand is the module's command line, `app`. If `app` is a group, `MODULE:NAME` adds one command of `app`.
         """
         module, _, part = module.partition(":")
 

@@ -1,10 +1,10 @@
-"""Flags made from the fields of a model, so that meaning, limits and default of each are written once.
+"""Flags made from the fields of a model, so that the meaning, limits and default of a flag are written once.
 
     class Settings(BaseModel):                            def listen(settings: Settings, plot: ...)
         uri: Annotated[str, Flag(...)] = Field(...)  ──▶      listen --uri URI --plot
 
-Typer reads the flags of a command from its signature. `expanded` gives a command a signature with several flags in
-place of a parameter; a call composes the parameter from the values of the flags.
+Typer reads the flags of a command from the signature of a function. `expanded` replaces a parameter in the signature
+by several flags. When the command is called, the values of the flags are composed to the value of the parameter.
 """
 
 import functools

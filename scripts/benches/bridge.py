@@ -1,10 +1,11 @@
 """Comparison of this client with roslibpy on one hub, and of the hub with a model of the reference server.
 
-The peer of each measured client or server is a bare socket, which does not encode or decode:
+A bare socket neither encodes nor decodes messages. The measured paths are:
 published:  client -> hub -> bare socket
 received:   bare socket -> hub -> client
 round trip: client -> hub -> client
-Everything is measured in turns within one run, so that noise on the machine affects all alike.
+servers:    bare socket -> hub or model -> bare socket
+All clients and servers take turns within one run, so that noise on the machine affects each of them equally.
 """
 
 from __future__ import annotations

@@ -97,9 +97,10 @@ class Network:
         return {variable: inference.posterior(names[variable]).toarray() for variable in unknown}
 
     def evidences(self) -> dict[str, Known]:
-        """Return three sets of evidence: none; the likeliest states of the first leaves; their least likely states.
+        """Return three sets of evidence: `none` is empty, `likely` and `unlikely` fix the first leaves of the network.
 
-        The state of each leaf depends on the leaves before it, so that all states are possible together.
+        Each leaf gets its most or least likely state, given the states of the leaves before it. Only possible states
+        are used, so all states of a set are possible together.
         """
         leaves = [
             variable

@@ -38,13 +38,13 @@ class Excuses:
 
     Attributes:
         reasons: Reasons under which the stack may count losses.
-        readings: Whether readings may be lost before the master, whose counters then cannot include them (a
-            killed subscriber or master, a cut connection).
-        results: Whether results may be lost in the same way after the publisher.
-        most: Maximum number of lost readings, and of lost results; unlimited after a fault that holds up a process
-            or connection.
-        until: Time of publication of the first reading that has a result again. Because everything keeps its order,
-            earlier readings have a result or are lost by then, and later ones have no excuse.
+        readings: Whether readings may be lost before the master counts them. A killed subscriber, a killed master
+            or a cut connection can cause this loss.
+        results: Whether results may be lost after the master has counted them as published.
+        most: Maximum number of lost readings, and maximum number of lost results. It is unlimited after a fault
+            that holds up a process or connection.
+        until: Time of publication of the first reading that has a result again. The stack keeps the order of
+            readings, so only readings published before this time may be lost.
     """
 
     reasons: frozenset[str] = frozenset()

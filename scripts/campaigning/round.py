@@ -75,7 +75,7 @@ class Round:
         *,
         calm_frames: int,
     ) -> None:
-        """Store the arguments: `folder` is empty; `calm_frames` frames are computed between two steps."""
+        """Prepare a stack in the empty `folder`. The stack computes `calm_frames` frames between two steps."""
         self._rng, self._topology, self._calm_frames = rng, topology, calm_frames
         self.stack = Stack(folder, topology, deployment, rng)
         self.observer = Observer(expected)

@@ -244,7 +244,10 @@ def used_by(pid: int) -> tuple[int, int, int]:
 
 
 def _stat(pid: int) -> list[str]:
-    """Return the fields of /proc/PID/stat after the name: state, parent, ...; `Z` and `0` if the process has ended."""
+    """Return the fields of /proc/PID/stat after the name: first the state, then the parent's id, then the others.
+
+    If the process has ended, the fields are `Z` and `0`.
+    """
     try:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     except OSError:

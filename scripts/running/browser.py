@@ -122,12 +122,12 @@ class Visit:
         return box["x"] + float(data[0]), box["y"] + float(data[1])
 
     async def drag(self, to: Place, steps: int = 5, each: Each | None = None) -> float:
-        """Move the boat with the mouse, and return the time of its arrival, in milliseconds of the browser's clock.
+        """Drag the boat with the mouse. Return the boat's time of arrival in milliseconds of the browser's clock.
 
         Args:
-            to: Place as shares of the canvas's width and height.
+            to: Destination of the boat, as shares of the canvas's width and height.
             steps: Number of movements of the mouse.
-            each: Awaited after each movement, with the place of the mouse on the page.
+            each: Coroutine function, called after each movement with the place of the mouse on the page.
         """
         mouse, (x, y) = self.page.mouse, await self.boat()
         box = await self.part("posterior").bounding_box()

@@ -1,4 +1,4 @@
-"""The flags of the scripts; their help has the style of the commands: NUMBER, a|b, [default: 10]."""
+"""The flags of the scripts, with help in the style of the commands: NUMBER, a|b, [default: 10]."""
 
 import argparse
 import sys
@@ -38,7 +38,7 @@ class ScriptParser(argparse.ArgumentParser):
         return super().add_argument(*names, **options)
 
     def flag(self, name: str, text: str, default: Any = None, **options: Any) -> None:
-        """Add a flag whose value has the type of its default (text if it has none); an integer must be 1 or more."""
+        """Add a flag. Values have the type of `default`, or are text if there is none. An integer must be 1 or more."""
         kind = positive if isinstance(default, int) else str if default is None else type(default)
         self.add_argument(name, **{"help": text, "default": default, "type": kind, **options})
 

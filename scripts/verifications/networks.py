@@ -1,7 +1,7 @@
-"""Comparison of network readers and questions with an independent library (scripts/verify networks).
+"""Comparison of network readers and posteriors with an independent library, pyagrum (scripts/verify networks).
 
-pgmpy's wheel (pinned, hashed) --> *.bif --> pyagrum --> tables, the same networks as XMLBIF, NET and UAI
-                                     └─────▶ our readers ──▶ the same tables? ──▶ questions ──▶ pyagrum's posteriors?
+pgmpy's wheel (pinned, hashed) --> *.bif --> pyagrum --> tables; each network as XMLBIF, NET and UAI
+                                     └─────▶ our readers ──▶ equal tables? ──▶ questions ──▶ pyagrum's posteriors?
 """
 
 import argparse

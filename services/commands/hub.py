@@ -106,7 +106,11 @@ def access_policy(
     insecure: bool,
     danger: str,
 ) -> AccessPolicy:
-    """Return the access policy of the flags; a `host` beyond loopback needs `files`: certificate, key, tokens."""
+    """Return the access policy of the flags, or raise a SettingsError.
+
+    `files` are the files of the certificate, the key and the tokens. Unless `insecure` is set, a `host` beyond
+    loopback needs all three files.
+    """
     certificate, key, tokens = files
     if (certificate is None) != (key is None):
         raise SettingsError(

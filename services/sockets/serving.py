@@ -234,10 +234,10 @@ class RunService(ABC):
         self._logs_frames = settings.log_level == "debug"
 
     async def run(self) -> int:
-        """Serve until cancelled, or until an error, which is also sent to the master.
+        """Serve until cancelled, or until an error. Errors are also sent to the master.
 
         Raises:
-            OutdatedError: A master requires the deployment now in the folder, and this service loaded an earlier one.
+            OutdatedError: A master requires the folder's present deployment, but this service loaded an earlier one.
         """
         settings = self._settings
         status = serve_status(settings.run_directory, self.role, self.status, metrics=settings.metrics)

@@ -216,17 +216,17 @@ def measure(
 
 
 class _Reading(NamedTuple):
-    """Results of a reading, which was run once with each bank of seeds.
+    """Results of a reading. The boards ran the reading once with each bank of seeds.
 
     Attributes:
-        is_likely: Whether the reading is possible in the model; true without a model.
-        is_possible: Whether some line can count, according to the codes.
-        lengths: Cycles with each bank.
+        is_likely: Whether the reading is possible according to the model. True if there is no model.
+        is_possible: Whether at least one line can count according to the codes.
+        lengths: Cycles of the run with each bank.
         without: Number of runs without a posterior.
         overflow: Number of runs that ended with an overflow.
-        prior: uint16[lines], the prior that the filter wrote for it, or None.
-        differences: Results of `_differences` for the machine against its codes and, if there is a model, for the
-            codes against the model and the machine against the model.
+        prior: uint16[lines], the prior that the filter wrote for this reading, or None without a filter.
+        differences: Results of `_differences` for the machine against exact inference from the codes. If there is a
+            model, results for the codes against the model, and for the machine against the model, follow.
     """
 
     is_likely: bool

@@ -46,16 +46,16 @@ _Run: TypeAlias = tuple[int, tuple[int, float, float], int, Estimate]
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A machine for a question; if it is refused, the fields after `refused` keep their defaults.
+    """A machine for a question. If the machine is refused, all fields after `refused` keep their defaults.
 
     Attributes:
-        refused: The reason why it cannot answer the question; empty if it can.
-        setting: Its target count (BM1) or samples (BM2).
-        total_variation: Mean distance from exact inference with this setting; 1 for a frame without a posterior.
+        refused: Reason why the machine cannot answer the question, or empty.
+        setting: Target count of a BM1, or number of samples of a BM2.
+        total_variation: Mean distance from exact inference with this setting. A frame without a posterior counts as 1.
         cycles: Median cycles of a frame.
-        seconds: The time of these cycles at the clock frequency.
-        alms, blocks: Estimated numbers of ALMs and of memory blocks on one of its boards.
-        unfit: The reason why a board of this device cannot hold it; empty if it can.
+        seconds: Time of `cycles` at the clock frequency.
+        alms, blocks: Estimated numbers of ALMs and of memory blocks on one board.
+        unfit: Reason why a board of this device cannot hold the machine, or empty.
     """
 
     machine: str

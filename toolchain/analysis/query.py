@@ -116,11 +116,11 @@ def answer(
     known: Mapping[str, str],
     machine: MachineChoice | None = None,
 ) -> Answer:
-    """Return the exact posterior of the searched variables for known states, and a machine's if one is asked for.
+    """Return the exact posterior of the searched variables for known states. With `machine`, add the machine's posterior.
 
     Raises:
-        ToolchainError: A variable or state does not exist, the states are impossible together, inference needs a table
-            above the limit, or the kind of machine asked for cannot answer the question.
+        ToolchainError: A variable or state does not exist, or the known states are impossible together. It is also
+            raised if inference needs a table above the limit, or if this kind of machine cannot answer the question.
     """
     question = joint.ask(searched, list(known))
     addresses = tuple(symbol.index(known[symbol.name]) for symbol in question.known)

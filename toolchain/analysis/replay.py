@@ -132,9 +132,10 @@ class PartFile:
     @classmethod
     @contextmanager
     def opened(cls, path: Path, key: str, layout: "np.dtype[np.void]", frames: int) -> Iterator["PartFile"]:
-        """Open or create the file, locked, with room for all records; remove it if the block ends without an error.
+        """Open or create the file, lock it, and reserve room for all records.
 
-        The file begins with `key`. A record that was not written, or only in part, has a wrong checksum.
+        The file begins with `key`. A record that is absent or incomplete has a wrong checksum. If the `with` block
+        ends without an error, the file is removed.
 
         Raises:
             BuildError: The file cannot be written, is locked by another run, or has another key.

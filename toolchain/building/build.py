@@ -181,10 +181,10 @@ def build_date(model_file: Path) -> str:
 
 
 def _model_hash(plan: MachinePlan | BM2Plan, codes: Sequence[NDArray[Any]]) -> str:
-    """Return the SHA-256 (hexadecimal) of a machine over all boards, with the model's and the variables' names.
+    """Return the SHA-256 (hexadecimal) of the machine over all boards.
 
-    It covers `codes` and, for a BM2, which values are possible; it does not cover probabilities, because their last
-    bits depend on the mathematics library.
+    The hash covers the names of the model and the variables, and `codes`. It does not cover probabilities, because the
+    last bits of a probability depend on the mathematics library.
     """
     model, parameters = plan.model, plan.parameters
     words: dict[str, Any] = {

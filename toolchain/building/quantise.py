@@ -1,9 +1,9 @@
-"""Quantising: conversion of probabilities to codes of W bits, after scaling, and what is lost by it.
+"""Quantising: scaling of probabilities, their conversion to codes of W bits, and the loss of the conversion.
 
-A factor that is the same for all lines does not change the posterior, so by default every row of a column's table (the
-likelihoods of one value of the variable) is divided by its maximum over all lines of all boards. Otherwise a machine
-would rarely count. An outlier floor is a small probability that a model gives to every value, so that no single outlier
-excludes the true line. If the floor is so small that its code is 0, one outlier excludes it.
+A row of a column's table has the likelihoods of one value of the variable. A factor common to all lines does not change
+the posterior. By default, each row is therefore divided by its maximum over all lines of all boards. Without this
+division, a machine would rarely count. An outlier floor is a small probability that a model gives to every value. If
+the code of the floor is not 0, a single outlier does not exclude the true line.
 """
 
 import math

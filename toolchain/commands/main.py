@@ -1,6 +1,6 @@
-"""The `toolchain` command (thesis 3.4), and its smaller subcommands: `regenerate`, `fit` and `new`.
+"""The `toolchain` command (thesis 3.4), and the smaller subcommands `regenerate`, `fit` and `new`.
 
-Modules of commands import NumPy, and what needs it, inside their functions, so that `--help` is fast.
+Modules of commands import NumPy, and modules that need NumPy, only inside functions. Thus `--help` is fast.
 """
 
 import difflib

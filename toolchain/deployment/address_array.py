@@ -23,12 +23,13 @@ from toolchain.errors import NotANumberError, ReadingError, ReadingMissingError
 def written_codes(likelihoods: NDArray[np.float64], *, prob_bits: int, scale: Scale) -> NDArray[np.uint16]:
     """Return the codes of one sensor's likelihoods in a frame, one per line (`sensor_mode = threshold`).
 
-    The likelihoods are float64[..., lines]: P(the sensor's reading | S = line). The codes have the same shape. With
-    the scale `column`, each row is divided by its maximum, because only ratios matter; with `none`, values up to 1
-    are encoded unchanged.
+    The likelihoods are float64[..., lines]: P(the sensor's reading | S = line). The codes have the shape of the
+    likelihoods. With the scale `none`, likelihoods are encoded unchanged. With any other scale, each row is divided by
+    its maximum, because only ratios matter.
 
     Raises:
-        ReadingError: A likelihood is not a probability, or a whole row is 0.
+        ReadingError: A likelihood is negative or not finite. With the scale `none`, a likelihood is above 1. With any
+            other scale, a whole row is 0.
     """
     if not np.isfinite(likelihoods).all():
         raise ReadingError("a likelihood is not finite")

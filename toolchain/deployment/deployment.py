@@ -214,8 +214,8 @@ class Deployment(DeploymentFile):
 def deployment_hash(deployment: DeploymentFile) -> str:
     """Return the SHA-256 (hexadecimal) of the part of a deployment that follows from the model.
 
-    URIs, endpoints, units of readings and the like are left out: `deployment.toml` may be edited for another robot,
-    but not so that it contradicts the tables in the images.
+    The hash leaves out URIs, endpoints, units of readings and similar keys, so that a user can edit them for another
+    robot. Any edit that contradicts the tables in the images changes the hash.
     """
     content = deployment.model_dump(
         mode="json",

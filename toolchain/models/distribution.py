@@ -337,13 +337,15 @@ def conditional_normal(
     floor: float = 0.0,
     outliers: float = 0.0,
 ) -> Distribution:
-    """Return P(symbol | given), normal around a function of its parents; wrapped if the symbol's type wraps.
+    """Return P(symbol | given), a normal distribution around a function of the parents.
+
+    If the symbol's type wraps, the normal distribution wraps too.
 
     Args:
-        symbol: An integer or interval symbol; each value gets the integral of the normal over its interval.
-        given: The parents of `symbol`; none for a plain normal.
+        symbol: An integer or interval symbol. Each value gets the integral of the normal over the value's interval.
+        given: The parents of `symbol`, or () for a normal without parents.
         mean: A function of the parents' values, or numbers that broadcast to the parents' sizes.
-        sigma: The standard deviation, likewise.
+        sigma: The standard deviation, in either form of `mean`.
         floor: The minimum probability of a value, relative to the peak.
         outliers: Share of readings that do not depend on the parents.
 

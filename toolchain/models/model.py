@@ -277,11 +277,11 @@ def dimension(
 ) -> Dimension:
     """Return a searched dimension: `size` cells with centres at `offset`, `offset + step` and so on.
 
-    `unit` is that of offset and step, such as m; `states` are the names of the cells, if any.
+    `unit` is the unit of `offset` and `step`, such as m. `states` are the names of the cells, or () without names.
 
     Raises:
-        ModelError: There are no cells, the name is empty, the number of states is not the number of cells, or
-            the step is 0.
+        ModelError: There are no cells or too many, the name is empty, or the step is 0. It is also raised if the
+            number of states is not the number of cells.
     """
     check_size(f"searched dimension {str(label)[:NAME_MAX]!r}", size, MAX_LINES)
     try:
@@ -334,12 +334,12 @@ def exact_posterior(
 ) -> NDArray[np.float64]:
     """Return P(S | readings) of the unquantised model, float64[lines].
 
-    `addresses` has one address per known variable, in the order of the columns; None for a missing reading. If each
-    line has its own reading (`sensor_mode = cell`), an address is int64[lines]. `prior_address` is the row of the
-    selected prior; None for the prior without a selection. `prior` replaces the prior of the model.
+    `addresses` has one address per known variable, in the order of the columns. The address of a missing reading is
+    None. If each line has its own reading (`sensor_mode = cell`), an address is int64[lines]. `prior_address` is the
+    row of the selected prior, or None if the model selects no prior. `prior` replaces the prior of the model.
 
     Raises:
-        ModelError: The number of addresses is wrong, an address is not a row of its table, or the readings are
+        ModelError: The number of addresses is wrong, an address is not a row of the table, or the readings are
             impossible on every line.
     """
     if len(addresses) != len(model.known):
