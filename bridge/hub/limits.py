@@ -48,9 +48,9 @@ class RefusedOperationError(BridgeError):
 class HubLimits:
     """Bounds of one hub, all above 0. Sizes are bytes, times are seconds.
 
-    The hub refuses and logs an operation that exceeds a bound. It answers only calls and goals, with
-    `result: false`; the reference server does not answer errors either. The hub disconnects a client only for
-    a message that is too large, for answers that the client never reads, or for a silent or stuck socket.
+    Like the reference server, the hub logs and refuses an operation that exceeds a bound, without an answer.
+    Only calls and goals are answered, with `result: false`. The hub disconnects a client only for a message
+    that is too large, for answers that the client never reads, or for a silent or stuck socket.
 
     Attributes:
         message_bytes: Size of one WebSocket message, in both directions. A larger message closes the connection
