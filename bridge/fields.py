@@ -116,7 +116,10 @@ class Field:
 
 
 def all_missing(fields: Sequence[Field], message: dict[str, Any]) -> FieldMissingError:
-    """Return the error for a message without these variables; it names all of them, and lists the message's fields."""
+    """Return the error for a message that lacks these variables.
+
+    The error names the variables, at most `MAX_LISTED` of them, and lists the fields of the message.
+    """
     first, *others = fields
     if not others:
         return first.missing(message)

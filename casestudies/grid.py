@@ -9,8 +9,8 @@ from dataclasses import dataclass
 class Grid:
     """A grid of cells over [x_low, x_high] and [y_low, y_high], in the units of a map.
 
-    Cells are numbered from the lower left corner in row-major order, like the lines of the machine: line =
-    row * width + column (row along y, column along x).
+    Each cell has a line of the machine: line = row * width + column. Rows are counted along y and columns along x, from
+    the lower left corner.
     """
 
     x_low: float

@@ -137,7 +137,10 @@ class BM2Kind(MachineKind):
         return _OnHost(machines)
 
     def infer(self, results: Sequence[BoardResult], variables: Sequence[str] = ()) -> Inference:
-        """Return the posterior of all chains; the details name the boards left out: timed out, or without a sample."""
+        """Return the posterior of the chains of all boards.
+
+        If a board timed out or has no sample, its chain is left out, and the details of the result name the board.
+        """
         chains, every = [], [_kept(board) for board in results]
         if len({(kept.parameters.cardinalities, kept.parameters.searched) for kept in every}) > 1:
             raise MachineError("The results of the boards are those of different models.")

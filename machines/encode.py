@@ -8,12 +8,13 @@ from machines.parameters import PROB_BITS_MAX
 
 
 def encode_probability(p: npt.ArrayLike, prob_bits: int) -> npt.NDArray[np.uint16]:
-    """Return the codes of the nearest probabilities that a cell can represent, in the same shape; ties are rounded up.
+    """Return the code of each probability in `p`, in an array of the shape of `p`.
 
-    A cell of W bits, 1 to 16, represents k / 2**W for 0 <= k <= 2**W - 2, and 1 with the all-ones code.
+    A probability is rounded to the nearest probability that a code of W bits represents. Ties are rounded up. For 0 <=
+    k <= 2**W - 2, code k represents k / 2**W. The all-ones code represents 1. W is `prob_bits`, from 1 to 16.
 
     Raises:
-        ParameterError: A probability is not from 0 to 1 (or is NaN), or `prob_bits` is out of range.
+        ParameterError: A probability is NaN or not from 0 to 1, or `prob_bits` is out of range.
     """
     _check_bits(prob_bits)
     probabilities = np.asarray(p, dtype=np.float64)

@@ -1,6 +1,7 @@
-"""Compiled functions of the fast kernel, and their arrays; the functions compute a block's words and count the ones.
+"""Compiled functions of the fast kernel, and the arrays that they use.
 
-They are in one file because numba recompiles a function when its file changes, but not when an imported file does.
+The functions compute the bits of a block of cycles as words, and count the ones. All functions are in one file, because
+numba recompiles a function if its own file changes, but not if an imported file changes.
 """
 
 from collections.abc import Callable
@@ -35,7 +36,7 @@ def jit(function: _Function) -> _Function:
 
 
 class Generators(NamedTuple):
-    """Linear maps that advance an LFSR; all columns use the same maps, each on its own state."""
+    """Linear maps that advance an LFSR. All columns use one set of maps, and each column has its own state."""
 
     jumps: Words  # [bits, bits / 8, 256]: the state 2**i clocks later
     bits: Words  # [prob_bits, bits / 4, 16, BLOCK_WORDS]: the next block of each output bit

@@ -86,29 +86,30 @@ class SampleEvery(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BM1Parameters:
-    """Parameters of a BM1: a matrix of `lines` lines and `sensors` + 1 columns; column 0 is the prior.
+    """Parameters of a BM1, a matrix of `lines` lines and `sensors` + 1 columns. Column 0 is the prior.
 
     Attributes:
-        lines: Lines of the matrix, one per value of the searched variable (M in the thesis).
-        sensor_bits: Address bits of each sensor column's table, columns 1..N. The top address of each column
+        lines: Number of lines, one per value of the searched variable (M in the thesis).
+        sensor_bits: Address bits of the table of each sensor column, for columns 1..N. The top address of a column
             means a missing reading, so a column of b bits supports 2**b - 1 values.
         prob_bits: Bits of a probability code (W), 1 to 16.
-        prior_bits: Address bits of the prior's table; 0 for a table with a single row.
-        prior_mode: `table`, or `written`: the host writes the codes with the start; until then, the single
-            row of the table applies.
+        prior_bits: Address bits of the prior's table. A table with a single row has 0.
+        prior_mode: `table` or `written`. With `written`, the host writes the prior's codes with the start. Until then,
+            the single row of the prior's table applies.
         counter_bits: Bits of a line's counter, 1 to 32.
-        rng: Kind of random number generators. An LFSR must be wider than a code; otherwise its low bits would
-            never all be 0, and code 1 would never make a one.
-        shared: One generator per column, shared by all its lines; otherwise one per cell.
-        steps_per_clock: Steps of a generator per cycle. 0 is replaced by the default: for an LFSR the
-            smallest power of two that is at least `prob_bits`, so that every cycle uses fresh bits; 1 for
-            `table` and `ideal`.
-        rng_banks: Number of seed sets; a start selects one.
+        rng: Kind of random number generators. An LFSR must be wider than a code. Otherwise the low bits of the LFSR
+            would never all be 0, and code 1 would never make a one.
+        shared: Whether each column has one generator for all its lines. If False, each cell has its own generator.
+        steps_per_clock: Steps of a generator per cycle. 0 selects the default. For an LFSR, the default is the smallest
+            power of two that is at least `prob_bits`, so every cycle uses fresh bits. For `table` and `ideal`, it is 1.
+        rng_banks: Number of seed sets. A start selects one set.
         rng_reset: Whether a start restarts the generators.
         ideal_seed: Seed of the `ideal` generator, 64 bits.
-        sensor_mode: `column`: one address per sensor column; `cell`: one address per cell; `threshold`: one
-            code per cell, without tables, and `sensor_bits` equal to `prob_bits`.
-        replicas: Machines that share the generators, each with its own inputs, counters, stop and cycles.
+        sensor_mode: `column`, `cell` or `threshold`. With `column`, each sensor column has one address. With `cell`,
+            each cell has its own address. With `threshold`, each cell has a code as its input, without a table. The
+            `sensor_bits` of each column then equal `prob_bits`.
+        replicas: Number of machines that share the generators. Each machine has its own inputs, counters, stop and
+            cycles.
 
     Raises:
         ParameterError: A machine with these parameters cannot be built.
@@ -187,7 +188,10 @@ class BM1Parameters:
 
     @property
     def input_shape(self) -> tuple[int, ...]:
-        """Shape of a frame's inputs: [sensors], or [sensors, lines] with one per cell; replicas are a first axis."""
+        """Shape of a frame's inputs: [sensors], or [sensors, lines] if each cell has its own input.
+
+        Several replicas add a first axis.
+        """
         shape = (self.sensors,) if self.sensor_mode is SensorMode.COLUMN else (self.sensors, self.lines)
         return shape if self.replicas == 1 else (self.replicas, *shape)
 

@@ -1,4 +1,7 @@
-"""The reference BM1, which runs one cycle at a time as in the thesis; other kernels are tested against it."""
+"""The reference kernel of a BM1.
+
+It runs one cycle at a time, as in the thesis. Tests compare the other kernels with it.
+"""
 
 import numpy as np
 import numpy.typing as npt

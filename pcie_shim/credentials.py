@@ -1,14 +1,14 @@
-"""The key that the two ends of a link over TCP share, and their proofs that they have it.
+"""The key that both ends of a TCP link share, and the proofs that an end has the key.
 
-Before its greeting, a board with a key sends a challenge. The host answers with a proof that it has the key, and gets
-the proof of the board. Neither proof reveals the key or is valid for another link.
+Before its greeting, a board with a key sends a challenge. The host answers with a proof that it has the key. Then the
+board sends its own proof. Neither proof reveals the key, and neither proof is valid for another link.
 
     board                                   host
       │── AUTHENTICATE board nonce ─────────▶│
       │◀─ AUTHENTICATE host nonce, proof ────│   HMAC("rosbayes host" + both nonces)
       │── reply: proof, then the greeting ──▶│   HMAC("rosbayes board" + both nonces)
 
-The proofs protect only the beginning of a link; on a network that is not trusted, tunnel the link through ssh or
+The proofs protect only the beginning of a link. If the network is not trusted, tunnel the link through ssh or
 WireGuard.
 """
 

@@ -183,10 +183,10 @@ class Posterior:
         return means
 
     def best_value(self) -> dict[str, float | str]:
-        """Return the most probable cell as a value in its unit, or the name of a state, for each label.
+        """Return the most probable cell: for each label, a value in the label's unit or the name of a state.
 
         Raises:
-            LabelError: The deployment is not known.
+            LabelError: The deployment that produced the posterior is not known.
         """
         best = self.best()
         return {axis.label: axis.value(best[axis.label]) for axis in self._known_axes()}
@@ -384,7 +384,7 @@ _ARRAY: Final = TypeAdapter(_Float64MultiArray)
 
 
 def read_posterior(message: dict[str, Any], heard_ns: int, topic: str = RESULTS_TOPIC) -> Posterior:
-    """Return the posterior in a std_msgs/Float64MultiArray; without a layout, its only label is `cell`.
+    """Return the posterior in a std_msgs/Float64MultiArray. If the array has no layout, the only label is `cell`.
 
     Raises:
         BadResultError: A value is not a probability, or the layout does not match the data.

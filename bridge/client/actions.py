@@ -231,7 +231,10 @@ GoalHandler = Callable[[GoalRequest], Awaitable[Mapping[str, Any] | None]]
 
 
 async def execute(goal: GoalRequest, handler: GoalHandler, action: str) -> None:
-    """Run a goal's handler, and end the goal with the values that it returns; if it fails, abort the goal."""
+    """Run a goal's handler, and end the goal with the values that the handler returns.
+
+    If the client has asked to cancel the goal, the goal ends as cancelled. If the handler fails, the goal is aborted.
+    """
     # The handler may have ended the goal already; then the end here has no effect.
     try:
         values = await handler(goal)

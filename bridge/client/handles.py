@@ -322,18 +322,19 @@ class Publication(Handle):
         self._register()
 
     async def publish(self, msg: Mapping[str, Any], *, timeout: float = 5.0) -> None:
-        """Send one message, whose values may be NumPy arrays, and return when the socket has accepted it.
+        """Send one message, and return when the socket has accepted the message.
 
-        It is sent at once if the server keeps up; otherwise it waits for its turn, at most `timeout` seconds.
-        Messages are not stored while the connection is lost, because old readings are useless.
+        Values of the message may be NumPy arrays. If the server does not keep up, the message waits for its turn, at
+        most `timeout` seconds. Messages are not stored while the connection is lost, because old readings are useless.
 
         Raises:
             DisconnectedError: There is no connection now, or the publication or the client is closed.
-            SlowPeerError: The server did not accept it in time, or `queue_size` messages are already waiting.
-            MessageTooLargeError: It is larger than `max_size`, or than the known limit of the server: `bridge.hub`
-                announces its limit, and other servers reveal theirs by closing the connection once.
-            MessageTypeError: It has a field that its type does not have, or an array of another shape.
-            EncodeError: It cannot be sent as JSON; for a NaN or infinity, the error names the field.
+            SlowPeerError: The server did not accept the message in time, or `queue_size` messages are already waiting.
+            MessageTooLargeError: The message is larger than `max_size`, or than the known limit of the server.
+                `bridge.hub` announces its limit. The client learns the limit of another server when that server closes
+                the connection because of a large message.
+            MessageTypeError: The message has a field that its type does not have, or an array of another shape.
+            EncodeError: The message cannot be sent as JSON. If a value is NaN or infinite, the error names the field.
         """
         session = self._session
         # The usual case has no `await` at all: a task switch would take longer than sending.

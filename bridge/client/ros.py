@@ -429,36 +429,36 @@ def connect(
     check_types: bool = True,
     on_state: StateCallback | None = None,
 ) -> Ros:
-    """Create a client of a rosbridge server, which `async with` opens and closes.
+    """Create a client of a rosbridge server. `async with` opens and closes the client.
 
-    If the first connection fails, `async with` raises `UnreachableError` or `NotRosbridgeError`. If the
-    connection is lost later, the client reconnects with a back-off from 0.1 s to 2 s, and restores all
-    advertisements, subscriptions and services.
+    If the first connection fails, `async with` raises `UnreachableError` or `NotRosbridgeError`. If the connection is
+    lost later, the client reconnects with a back-off from 0.1 s to 2 s. It then restores all advertisements,
+    subscriptions and services.
 
     Args:
-        uri: `ws://host:port`, or `wss://` for TLS, whose certificate is always verified; or `robot:NAME`, which is
-            looked up when the client is opened (`bridge.discovery`).
+        uri: `ws://host:port`, `wss://host:port` for TLS, or `robot:NAME`. With TLS, the client always verifies the
+            server's certificate. The name of a robot is looked up when the client is opened (`bridge.discovery`).
         connect_timeout: Timeout in seconds of the first connection, and of looking up a robot before it.
-        retry: Whether to repeat the first attempt until `connect_timeout` is over, while nothing answers at the URI;
-            `on_state` is then called with `CONNECTING` and the reason, once.
-        ros_version: ROS version of type names on the wire. `auto` uses ROS 1, which ROS 2 servers accept too,
-            until `Ros.detect_ros_version` has detected the version.
-        token: Sent as `Authorization: Bearer TOKEN`; like all headers it is never logged.
+        retry: Whether to repeat the first attempt until `connect_timeout` is over if nothing answers at the URI. The
+            client then calls `on_state` once, with `CONNECTING` and the reason.
+        ros_version: ROS version of the type names that the client sends. `auto` uses names of ROS 1 until
+            `Ros.detect_ros_version` has detected the version. ROS 2 servers accept names of ROS 1 too.
+        token: Token of the header `Authorization: Bearer TOKEN`. The client never logs headers.
         headers: Additional headers of the handshake.
-        ca_file: Certificate authorities (PEM) for the server, instead of those of the system.
+        ca_file: Certificate authorities (PEM) for the server, instead of the system's authorities.
         tls: An SSL context instead of `ca_file`, for example with a client certificate.
-        max_size: Maximum size of a message in bytes, in both directions. A larger inbound message ends the
-            connection, and its topic is not subscribed to again (`TopicLeftOutError`).
+        max_size: Maximum size of a message in bytes, in both directions. If a larger message arrives, the connection
+            ends, and the client does not subscribe to the message's topic again (`TopicLeftOutError`).
         ping_interval: Seconds of silence after which the server is pinged.
         ping_timeout: Seconds to wait for data after a ping before the connection counts as lost.
-        check_types: Whether to refuse messages, requests and goals with a misspelt field or an array of another shape
-            before they are sent, if their type is known.
+        check_types: Whether to check messages, requests and goals of known types before they are sent. The check
+            refuses a misspelt field, and an array of another shape.
         on_state: Callback for each new state and its reason.
 
     Raises:
         UriError: The URI is not a WebSocket URI.
-        OptionError: An option is out of its range, or a file cannot be read. For `robot:NAME`, errors about
-            the route are raised when the client is opened.
+        OptionError: An option is out of its range, or a file cannot be read. For `robot:NAME`, errors about the route
+            are raised when the client is opened.
     """
     if ros_version not in {"auto", "1", "2"}:
         raise OptionError(f"ros_version must be auto, 1 or 2, not {ros_version!r}")

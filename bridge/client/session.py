@@ -425,7 +425,12 @@ class Session:
             )
 
     def must_wait(self) -> bool:
-        """Return whether a message must wait for its turn; raise an error without a connection."""
+        """Return whether a message must wait for its turn.
+
+        Raises:
+            DisconnectedError: There is no connection.
+            WrongThreadError: The caller runs in another thread than the client's event loop.
+        """
         if get_ident() != self._thread:  # `check_thread` without its call, for each message that is published
             self.check_thread()
         return self._connected().paused or self._waiting > 0

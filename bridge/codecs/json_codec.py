@@ -2,15 +2,17 @@
 
 Inbound:
 
-* One WebSocket message holds one object. The last of several equal keys wins, as in the servers' parsers.
-* `NaN`, `Infinity`, `-Infinity`, which some servers leak although JSON excludes them, and numbers beyond float64
-  (`1e999`) are read as None, like the `null` that the reference server sends instead.
-  For this, messages that are not strict JSON are parsed a second time.
+* One WebSocket message holds one object. If a key occurs several times, the last value wins, as in the servers'
+  parsers.
+* `NaN`, `Infinity` and `-Infinity` are read as None. JSON excludes them, but some servers send them. The reference
+  server sends `null` instead, which is read as None too.
+* Numbers beyond float64 (`1e999`) are also read as None.
+* Messages that are not strict JSON are parsed a second time, by a lenient parser.
 * Integers beyond 64 bits become floats.
 
-Outbound: NaN and infinities are refused by an error that names the field, because JSON has neither, and servers
-silently drop `null` in a float field. NumPy arrays and scalars are written without intermediate lists; NumPy is never
-imported here. Bytes are written as base64, like `uint8[]` by servers.
+Outbound: a message with NaN or an infinity is refused, and the error names the field. JSON has no such numbers, and
+servers silently drop `null` in a float field. NumPy arrays and scalars are written without intermediate lists. NumPy is
+never imported here. Bytes are written as base64, as servers write `uint8[]`.
 """
 
 import base64

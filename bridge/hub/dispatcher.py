@@ -96,7 +96,7 @@ class Dispatcher:
         return min((client.outbox.deadline for client in self.throttled), default=inf)
 
     def send_status(self, client: Client, sentence: str, operation_id: object, now: float) -> None:
-        """Send a status message about an error; if the client does not read, its oldest status messages are dropped."""
+        """Send a status message about an error. If the client does not read, drop its oldest status messages."""
         status: dict[str, object] = {"op": "status", "level": "error", "msg": sentence}
         if isinstance(operation_id, str | int) and not isinstance(operation_id, bool):
             status["id"] = operation_id

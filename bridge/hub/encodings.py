@@ -41,10 +41,11 @@ def encoding_of(requested: object) -> Encoding:
 
 
 def as_png(payload: bytes) -> bytes:
-    """Wrap an operation in an operation `png`: the bytes of its JSON are the pixels of a picture, in base64.
+    """Wrap a JSON operation in an operation `png`, which contains a PNG picture in base64.
 
-    As on the reference server, the picture is nearly square, with three bytes a pixel. Newlines, which JSON ignores,
-    fill it up (source: https://www.w3.org/TR/png-3/, chapters 5, 9 and 11).
+    The pixels of the picture are the bytes of the JSON, three bytes a pixel. As on the reference server, the picture is
+    nearly square. Newlines fill its last row, because JSON parsers ignore them. The
+    format is described in https://www.w3.org/TR/png-3/, chapters 5, 9 and 11.
     """
     pixels = -(-len(payload) // 3)
     width = math.isqrt(pixels)
@@ -80,7 +81,10 @@ class OutgoingMessage:
     """One published message, encoded on demand."""
 
     json: bytes
-    """JSON that ends, from index `_begin` on, with the message and one brace; kept whole, so that nothing is copied."""
+    """JSON of a publish operation, kept whole to avoid a copy.
+
+    The message begins at index `_begin`. Only the operation's last brace follows the message.
+    """
     _begin: int
     _parsed: dict[str, Any] | None
     """The parsed message, or None if it was not parsed yet."""

@@ -95,7 +95,10 @@ class Filler:
         return tail
 
     def fill_part(self, message: dict[str, Any], room: int) -> int:
-        """Fill a message inside another one; return how many bytes it grew by, or raise a RefusedOperationError."""
+        """Fill a nested message, and return the number of bytes by which it has grown.
+
+        Raises a RefusedOperationError if it would grow by more than `room` bytes.
+        """
         grown = _fill_parts(self.parts, message, room)
         if len(message) != self.count:
             absent, tail, _parts = self._known.get(tuple(message)) or self._look_up(message)

@@ -248,8 +248,8 @@ class _Hub:
     def stay_awake(self, now: float) -> None:
         """Poll the sockets for a moment after a client's response at `now`, if responses are prompt.
 
-        Without polling, client and hub sleep in turn while a message is on its way, and waking up takes longer than all
-        the rest. The hub does not poll for a client that only publishes, because it may need the processor core.
+        Without polling, the hub sleeps while a message is on its way, and waking up takes longer than the hub's other
+        work. If a client only publishes, the hub does not poll, because the client may need the processor core.
         """
         is_prompt, self._prompt_until = now < self._prompt_until, now + _AWAKE
         if self._is_polling:

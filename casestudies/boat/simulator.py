@@ -301,10 +301,10 @@ def boat_simulator(
         bool, typer.Option("--array", help="Publish std_msgs/Float64MultiArray instead of boat_msgs/Raw.")
     ] = False,
 ) -> int:
-    """Sail a boat about its map: publish noisy ranges and bearings, and the true pose on /boat/true_pose.
+    """Sail a boat on its map, and publish noisy ranges and bearings.
 
-    A velocity on /cmd_vel drives the boat, and a pose on /boat/set_pose moves it; services below /boat/ switch noise,
-    beacons and sensors.
+    The true pose is published on /boat/true_pose. A velocity on /cmd_vel drives the boat, and a pose on /boat/set_pose
+    moves the boat to that pose. Services below /boat/ switch noise, beacons and sensors.
     """
     say(f"boat-simulator: seed {seed}, {rate:g} readings a second on {topic}, {uri}")
     return run_async(simulate(uri, boat=Boat(seed, speed), rate=rate, topic=topic, array=array, count=count))

@@ -101,13 +101,13 @@ def line(numbers: Numbers) -> str:
 
 
 class BoatViewer:
-    """The frames that arrive while the viewer runs, also as JSON objects, and the pictures drawn from them.
+    """The frames that arrive while the viewer runs, and the pictures drawn from the frames.
 
     Attributes:
-        instances: The frames, the newest last; only the last `KEPT` if the viewer runs until Ctrl-C.
-        numbers: Each of these frames as a JSON object.
-        frames: The number of frames.
-        results: The number of frames with a posterior.
+        instances: The frames, the newest last. If the viewer runs until Ctrl-C, only the last `KEPT` frames are stored.
+        numbers: Each stored frame as a JSON object.
+        frames: The number of frames that have arrived.
+        results: The number of frames that have a posterior.
     """
 
     def __init__(self, count: int | None, clock_hz: float = CLOCK_HZ) -> None:

@@ -66,17 +66,17 @@ def run_bench(
     variables: Mapping[str, str] | None = None,
     options: Sequence[str] = (),
 ) -> Outcome:
-    """Run a cocotb module on an analysed design, and return what failed.
+    """Run a cocotb module on an analysed design, and return the failures.
 
     Args:
-        module: The bench's module, such as `hdl.test.bench_board`.
-        folder: Folder in which `prepare` analysed the design.
-        top: The entity under test.
-        variables: Further environment variables for the bench.
-        options: Further options of the simulation, such as generics.
+        module: Name of the cocotb module, such as `hdl.test.bench_board`.
+        folder: Folder in which `prepare` has analysed the design.
+        top: Name of the entity under test.
+        variables: Additional environment variables for the cocotb module.
+        options: Additional options of the simulation, such as generics.
 
     Raises:
-        HardwareToolError: The simulation did not end, or ended without a verdict.
+        HardwareToolError: The simulation did not end, or it ended without a verdict.
     """
     import cocotb_tools.config
     import find_libpython

@@ -210,14 +210,15 @@ class ServedServices(_Served):
         return self._wire.type_name(type_name, "srv")
 
     def answer(self, ticket: int, values: Mapping[str, Any] | str, *, ok: bool = True) -> None:
-        """Answer a request with fields, or with a reason as text if `ok` is False; no effect after a lost connection.
+        """Answer a request with fields, or with a reason as text if `ok` is False.
 
-        A reason is sent in an additional field `reason`, and `values` stays an empty object: the reference server drops
-        an answer whose `values` is a text (rosbridge_library/capabilities/service_response.py,
-        `service_response_msg_fields`), and its caller waits for ever. `bridge.hub` passes the reason on.
+        After a lost connection, the call has no effect. A reason is sent in an additional field `reason`, and `values`
+        is an empty object. The reference server drops an answer whose `values` is a text, so its caller would wait for
+        ever (rosbridge_library/capabilities/service_response.py, `service_response_msg_fields`). `bridge.hub` passes
+        the reason on.
 
         Raises:
-            EncodeError: The values cannot be encoded as JSON; the request is still pending.
+            EncodeError: The values cannot be encoded as JSON. The request is then still pending.
         """
         request = self._requests.get(ticket)
         if request is None:
