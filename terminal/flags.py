@@ -49,10 +49,10 @@ def default_of(model: type[BaseModel], name: str) -> str:
 
 
 def flags_of(model: type[BaseModel], names: Sequence[str], *, prefix: str) -> list[inspect.Parameter]:
-    """Return a command-line flag for each of these fields.
+    """Return a command-line flag for each of the model's fields in `names`.
 
-    A flag that the user omits is None; the field's value is then that of the environment variable `PREFIX...`, or its
-    default.
+    If the user omits a flag, the flag's value is None. The field then gets the value of the environment variable
+    `PREFIX...`, or else its default.
     """
     return [_flag_of(model, name, f"{prefix}{name.upper()}") for name in names]
 

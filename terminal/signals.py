@@ -81,7 +81,10 @@ def ignore_signals() -> None:
 
 
 async def until_one_ends(*work: Coroutine[Any, Any, object]) -> None:
-    """Run coroutines until one of them ends, cancel the others, and raise the error of the one that ended, if any."""
+    """Run coroutines until the first coroutine ends, and cancel the remaining coroutines.
+
+    If the coroutine that ended first has raised an error, this function raises the error.
+    """
     tasks = [asyncio.ensure_future(each) for each in work]
     try:
         ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

@@ -231,10 +231,10 @@ def _prepared(pickled: bytes, _thread: int) -> Work:
 
 
 def do_batch(pickled: bytes, numbers: Sequence[int], most_s: float, theirs: str) -> tuple[bytes, float]:
-    """Do pieces on a worker until `most_s` seconds are over, but at least one; return results and seconds taken.
+    """Do pieces on a worker until `most_s` seconds are over, but at least one piece.
 
-    The results are pickled and compressed, because a posterior is mostly zeros, and dask would send it through the
-    scheduler uncompressed. `theirs` is the client's `software()`.
+    Return the results and the seconds taken. The results are pickled and compressed, because a posterior is mostly
+    zeros, and dask would send the results uncompressed through the scheduler. `theirs` is the client's `software()`.
 
     Raises:
         ClusterError: This worker has another version of this software than the client.

@@ -1,10 +1,10 @@
-"""The time of transfers over the link by their size and the number of boards, for each --link-rate (thesis 2.3, 4.3).
+"""Time of transfers over the link by their size and the number of boards, for each --link-rate (thesis 2.3, 4.3).
 
 bench ── blocks of 1 to 8,192 words ──▶ INPUTS of 1, 2 or 4 boards, and back
 bench ── frames of 4,096 results on 1, 2 or 4 boards, sent with the done message or read ──▶ time without computing
 
-The time of the socket alone (--link-rate none) is part of every measurement. It is subtracted before the rate and the
-latency of a modelled link are fitted, which thus come from the clock of the host and not from the model.
+Every measurement includes the time of the socket. The bench measures this time with --link-rate none, and subtracts it
+from the other times. Then the bench fits the rate and the latency of each modelled link.
 """
 
 import argparse

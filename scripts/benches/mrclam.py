@@ -37,7 +37,7 @@ Figures = dict[str, Any]
 
 
 LandmarkReading = tuple[float | None, float | None]
-"""A reading of one landmark: range in metres, absolute bearing in radians (in any turn); each None if not seen."""
+"""Range in metres and absolute bearing in radians (in any turn) of one landmark. A missing value is None."""
 
 
 def unquantised_posterior(

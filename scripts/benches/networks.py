@@ -1,8 +1,9 @@
-"""BM2 on published networks: distance of its marginals, and of other Gibbs samplers' marginals, from exact inference.
+"""Distance of the marginals of BM2 and of other Gibbs samplers from exact inference, on published networks.
 
 pgmpy's wheel --> *.bif.gz --> our reader --> BM2, linear and coloured --> marginals --> total variation, per variable
-                     └───────▶ pyagrum ─────▶ exact inference ───────────────────────────────────▲
-                                   └────────▶ its Gibbs sampler; THRML's, with --thrml ──────────┘
+                    │              └──▶ Gibbs sampler of THRML, with --thrml ───────────────▲
+                    ├──▶ pyagrum ──▶ Gibbs sampler of pyagrum ──────────────────────────────┤
+                    └──▶ pyagrum ──▶ exact inference ───────────────────────────────────────┘
 """
 
 import argparse

@@ -1,4 +1,6 @@
-"""The cycle time with a subscriber and publisher started for each message (as probably in the thesis), or only once.
+"""Cycle time if a subscriber and a publisher are started for each message, compared with a single start.
+
+The thesis's script probably started both for each message.
 
 client --reading--> hub --> subscriber -> master -> pcie-app -> 4 boards -> pcie-app -> master -> publisher --> hub --> client
                             `-- started for each message, or once ------------------------------'

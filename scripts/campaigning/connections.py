@@ -26,16 +26,16 @@ _ANSWER = 1.0 * FACTOR
 
 @dataclass(slots=True)
 class Weather:
-    """Treatment of data by a proxy.
+    """Settings for the data that passes through a proxy.
 
     Attributes:
-        open: Whether data is forwarded; otherwise connections remain open and silent.
-        delay: Seconds by which each piece is delayed.
-        rate: Bytes per second; 0 for no limit.
-        spoil: Whether one bit of the next piece is flipped.
-        repeat: Whether the last piece is sent again before the next one.
-        cut_inside: Whether the connection is cut in the middle of the next piece.
-        insert: Bytes to send to each client before its next message.
+        open: Whether the proxy forwards data. If not, its connections remain open and silent.
+        delay: Seconds by which the proxy delays each piece of data.
+        rate: Maximum rate in bytes per second, or 0 for no limit.
+        spoil: Whether to flip one bit of the next piece.
+        repeat: Whether to send the last piece again before the next piece.
+        cut_inside: Whether to cut the connection in the middle of the next piece.
+        insert: Bytes to send to each client before the client's next message.
     """
 
     open: asyncio.Event = field(default_factory=asyncio.Event)

@@ -1,7 +1,8 @@
-"""The observer, which judges each result of the stack; it uses no sockets, no clocks and no code of the services.
+"""The observer, which judges each result of the stack. It uses no sockets, no clocks and no code of the services.
 
-Its caller reports published readings, readings that reached the stack, faults, and messages on `/bm/frame` and
-`/BMresults`. It records everything that is wrong. Counters are judged when nothing is in flight (`accounts.py`).
+The campaign reports to the observer the published readings, the readings that reached the stack, and the faults. It
+also reports the messages on `/bm/frame` and `/BMresults`. The observer records everything that is wrong. It judges
+counters when no reading is in flight (`accounts.py`).
 """
 
 import math

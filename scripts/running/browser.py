@@ -42,12 +42,12 @@ Each = Callable[[Place], Awaitable[None]]
 
 
 class Visit:
-    """A page of the dashboard in a window of its own.
+    """A page of the dashboard in its own browser window.
 
     Attributes:
-        page: Playwright's page.
+        page: The page as an object of Playwright.
         complaints: Errors on the console, uncaught exceptions, and requests to other computers.
-        may_lose_server: Whether to ignore errors of failed requests, as while the dashboard restarts.
+        may_lose_server: Whether to ignore errors of failed requests, for example while the dashboard restarts.
     """
 
     def __init__(self, page: Any) -> None:

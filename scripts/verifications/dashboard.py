@@ -103,7 +103,7 @@ class Scene:
             await self.news.wait_for(condition)
 
     async def put(self, x: float, y: float) -> None:
-        """Put the boat, which lies still, at (x, y), and wait until it is there."""
+        """Move the boat to (x, y), where it stops sailing, and wait until it is there."""
         place = await self.ros.advertise(SET_POSE_TOPIC, TRUE_POSE_TYPE)
         await place.publish(true_pose(x, y, header(time.time_ns(), "map")))
         await self.until(lambda: math.dist(self.boat, (x, y)) < 1, f"the boat is not at {x:g}, {y:g}")

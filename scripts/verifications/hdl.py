@@ -44,7 +44,10 @@ _ANSWER_S: Final = 120.0
 
 
 async def boat_failure(engine: str, count: int) -> str | None:
-    """Run frames on emulated boards, and again with one of them simulated; return why the results differ, or None."""
+    """Run frames on emulated boards, and again with one simulated board in place of an emulated one.
+
+    Return an error text if the boat cannot be built or the results differ, or None if the results agree.
+    """
     source = ("--uri", "ws://localhost:9090", "--topic", "/boat", "--type", "boat_msgs/Sensors")
     boat = ROOT / "casestudies" / "boat"
     async with temporary_stand() as stand:

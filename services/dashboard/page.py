@@ -1,7 +1,7 @@
-"""The page, its socket and its files, as a web application.
+"""The web application of the dashboard, with a page, a WebSocket and files.
 
 /          the page: layout, buttons and choices
-/live      WebSocket: messages of `View` to the browser; new poses and switch settings from the browser
+/live      WebSocket: sends messages of `View` to the browser, and receives new poses and switch settings
 /frames.*  the kept frames as files
 """
 

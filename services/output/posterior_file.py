@@ -106,7 +106,10 @@ def cell_names(labels: Sequence[str], sizes: Sequence[int]) -> list[str]:
 def write_archive(
     file: IO[bytes], frames: Sequence[FrameReport | Posterior | None], axes: Sequence[Axis], **arrays: Any
 ) -> None:
-    """Write an archive for `numpy.load`: `arrays`; number, stamp and cycles of each frame; the values of the axes."""
+    """Write an archive for `numpy.load`.
+
+    The archive contains `arrays` and the values of the axes, and the number, the stamp and the cycles of each frame.
+    """
     import numpy as np
 
     for name in ("frame", "stamp_ns", "cycles"):

@@ -105,7 +105,7 @@ class _SourceReader:
 
 
 def _plain(value: object) -> float | str | None:
-    """Convert a reading to a type that a record can hold; None if it is neither a number nor a text."""
+    """Return a number as a float, a text unchanged, and None for any other value, which a record cannot hold."""
     if isinstance(value, int | float):
         try:
             return float(value)

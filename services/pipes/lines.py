@@ -30,7 +30,7 @@ class LineReading(msgspec.Struct):
 
 
 class LineBoard(msgspec.Struct, omit_defaults=True):
-    """The result of a board; `reason` is its stop reason as a number, `why` the same in words."""
+    """The result of a board. `reason` is the number of its stop reason, and `why` is the name of this reason."""
 
     counts: list[Annotated[int, msgspec.Meta(ge=0, lt=1 << 32)]]
     cycles: _Unsigned

@@ -25,7 +25,9 @@ def reading_from_line(line: bytes, number: int) -> LineReading:
 
 
 def compute_lines(boards: DeployedBoards, banks: int) -> int:
-    """Compute the readings of standard input; the frames use the boards' seed banks in turn, from 0 to `banks` - 1.
+    """Compute a frame for each reading of standard input, and print its result.
+
+    Frames use the boards' seed banks from 0 to `banks` - 1, and then begin again with bank 0.
 
     Raises:
         InputLineError: A line is not a reading for this deployment.

@@ -208,8 +208,8 @@ def listening(
     """Return the function that creates a link over a local socket at the endpoint of `--listen`.
 
     Raises:
-        SettingsError: `listen` is not an endpoint; or, without `insecure`, other machines could reach the link or the
-            metrics.
+        SettingsError: `listen` is not an endpoint. If `insecure` is False, also if other machines could reach the link
+            or the metrics.
     """
     check_metrics(settings.metrics, insecure=insecure)
     endpoint = endpoint_from(listen, "--listen")

@@ -198,14 +198,15 @@ def recorded_readings(
 ) -> Readings:
     """Return at most `frames` readings of a recording (CSV, MCAP or bag), spread over its length.
 
-    With `in_sequence`, these are the first rows, and one that does not fit is kept with all its readings missing.
+    With `in_sequence`, the readings come from the first rows. If a row does not fit the machine, the result then
+    contains it with all its readings missing.
 
-    `given` has NAME=COLUMN for each variable whose column has another name; a `*` in both stands for the same text.
-    In a bag with several topics, the messages of one row may be up to `tolerance_s` apart.
+    `given` has NAME=COLUMN for each variable whose column has another name. A `*` in NAME and in COLUMN stands for
+    equal text. In a bag with several topics, the messages of one row may be up to `tolerance_s` apart.
 
     Raises:
         ModelError: The recording or a column does not exist, or no row fits the machine.
-        BuildError: An unknown variable, no frames, or too many.
+        BuildError: A variable in `given` is unknown, or `frames` is out of range.
     """
     check_frames(frames)
     columns = reading_columns([variable.name for variable in variables], given)
@@ -225,11 +226,11 @@ class Frames:
     """Rows of a recording.
 
     Attributes:
-        readings: The readings of all rows; all are missing in a row that does not fit.
-        fits: bool[rows], whether the machine takes all values of the row; a row that does not fit gets no posterior.
-        stamps: int64[rows], in nanoseconds, from a bag's messages or a CSV file's column of stamps; without stamps,
-            the rows' indices 0, 1, 2, ...
-        why: What is wrong with the first row that does not fit; empty if all do.
+        readings: The readings of all rows. If a row does not fit the machine, all its readings are missing.
+        fits: bool[rows], whether the machine takes all values of the row. A row that does not fit gets no posterior.
+        stamps: int64[rows], in nanoseconds, from a bag's messages or a CSV file's column of stamps. If there are no
+            stamps, the rows' indices 0, 1, 2, ...
+        why: The error of the first row that does not fit, or an empty string if all rows fit.
     """
 
     readings: Readings

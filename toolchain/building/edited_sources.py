@@ -55,10 +55,11 @@ _SHOWN: Final = 3
 
 
 def regenerate_images(directory: Path) -> tuple[list[str], list[tuple[str, Change]]]:
-    """Write the images again from the memories and parameters; return the edits, as sentences, and the changed files.
+    """Write the images again from the edited memories and parameters.
 
-    Edited sources are written in canonical form, and `deployment.toml` gets the hashes and parameters. An interrupted
-    call may leave new images whose hashes are not in `deployment.toml` yet; the next call accepts them and finishes.
+    Return the edits as sentences, and the changed files. Edited sources are written in canonical form, and
+    `deployment.toml` gets the new hashes and parameters. An interrupted call may leave new images before
+    `deployment.toml` has their hashes. The next call accepts such images and completes the work.
 
     Raises:
         BuildError: The sources contradict each other, or need another machine.

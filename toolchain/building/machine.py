@@ -218,12 +218,12 @@ def board_layout(
 ) -> BoardLayout:
     """Return the layout of a machine's boards, before any table is computed.
 
-    Without an `interface`, the registers have as many inputs and results as the largest board needs, because every
-    word takes resources (thesis 3.2, whose example is 20 x 1200).
+    Without an `interface`, the registers have as many inputs and results as the largest board needs, because every word
+    takes resources. The interface of the thesis's example has 20 x 1200 words (3.2).
 
     Raises:
-        BuildError: There are more boards than lines, the machine is larger than the interface, the interface is
-            larger than the register map, or there are too many seeds.
+        BuildError: There are more boards than lines, or too many seeds, or the sizes do not fit. A board must fit the
+            interface, and the interface must fit the register map.
     """
     blocks = partition_lines(parameters.lines, partitions)
     board = replace(parameters, lines=blocks[0].lines)

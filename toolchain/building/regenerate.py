@@ -122,11 +122,11 @@ def regenerate_project(directory: Path) -> Changes:
 
 
 def regenerate_deployment(directory: Path, edits: DeploymentEdits) -> Changes:
-    """Write `deployment.toml` again, with `edits` and with what was edited in it by hand; images do not change.
+    """Write `deployment.toml` again with `edits`. Changes made by hand in the file are kept, and images do not change.
 
     Raises:
         BuildError: An edit has a wrong value, or does not fit the deployment.
-        DeploymentError: The deployment is missing, damaged, or contradicts its images.
+        DeploymentError: The deployment is missing or damaged, or it contradicts its images.
     """
     deployment = edited(load_deployment(directory, edited=True), edits)
     check_agreement(deployment, read_images(deployment))

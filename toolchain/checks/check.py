@@ -1,8 +1,8 @@
-"""Checks of a model or a deployment before anything runs; findings use the model's names (thesis 3.4).
+"""Checks of a model or a deployment before anything runs. Findings use the model's names (thesis 3.4).
 
-A model is checked with its build options, a deployment with the codes of its images. Findings about codes are
-no estimates: a frame with a reading found impossible does end as `impossible` on the machine, and a line found dead
-never counts.
+A model is checked with its build options, and a deployment with the codes of its images. Findings about codes are
+exact. If a reading is found impossible, a frame with this reading ends as `impossible` on the machine. If a line is
+found dead, the line never counts.
 """
 
 import math

@@ -58,10 +58,14 @@ def _missing(variable: Variable, what: str) -> int | None:
 
 
 def _unserved(variable: Variable, value: float, beyond_top: bool | None) -> int | None:
-    """Return the address that `on_range` gives a value out of range, None for missing, or raise an error.
+    """Return the address for a value out of range as `on_range` requires, or None if the reading counts as missing.
 
-    `beyond_top` is True if the value lies beyond the variable's last value, False if before its first. It is None for
-    an infinite value of a periodic variable, which is nearer to neither.
+    `beyond_top` is True if the value lies beyond the variable's last value, and False if it lies before the first
+    value. It is None for an infinite value of a periodic variable, because neither end is nearer.
+
+    Raises:
+        ValueOutOfRangeError: The value has no address.
+        ReadingMissingError: The reading counts as missing, but `on_missing` is `error`.
     """
     if variable.on_range == "missing":
         return _missing(variable, f"is {_shown(value)}, out of range")

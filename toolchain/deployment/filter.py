@@ -101,8 +101,8 @@ def _header(shape: tuple[int, int]) -> bytes:
 def prediction_codes(prediction: NDArray[np.float64], prob_bits: int) -> NDArray[np.uint16]:
     """Return the codes of a predicted prior, uint16[lines], relative to its maximum.
 
-    A code is at least 1 where the prediction is above 0, however little: with a code of 0, no reading could bring
-    back a value to which the searched variable rarely changes.
+    A line with a prediction above 0 gets at least code 1. With code 0, its posterior would be 0 for all readings, even
+    if the searched variable has changed to the line's value.
     """
     codes = encode_probability(prediction / prediction.max(), prob_bits)
     codes[(codes == 0) & (prediction > 0)] = 1

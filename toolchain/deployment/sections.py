@@ -354,7 +354,7 @@ class BM1Section(CommonSection):
 
 
 class BM2Section(CommonSection):
-    """`[machine]` of a BM2: its parameters, its interface, and its stop conditions; each board runs one chain."""
+    """`[machine]` of a BM2: parameters, interface and stop conditions. Each board runs one chain."""
 
     type: Literal["BM2"] = "BM2"
     prob_bits: int = Field(default=16, ge=2, le=16)

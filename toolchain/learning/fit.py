@@ -1,14 +1,14 @@
 """Learning of tables from recordings with ground truth: normals with a share of outliers, or counts.
 
-**Normals.** A reading is `mean(S) + bias + noise` with noise N(0, sigma^2), or, for a share of the readings,
-uniform over the range of the variable. Bias, sigma and share are estimated by expectation maximisation from the
-residuals (reading minus mean) at the true position; the mean is assumed linear within a cell. A pool of variables may
-share sigma and bias. Every variable has its own share of outliers, estimated as if it had one more outlier and one
-more good reading (the mode with a Beta(2, 2) prior).
+**Normals.** A reading is `mean(S) + bias + noise` with noise N(0, sigma^2). A share of the readings are outliers, which
+are uniform over the range of the variable. Expectation maximisation estimates bias, sigma and share from the residuals
+at the true position. A residual is reading minus mean, and the mean is assumed linear within a cell. A pool of
+variables may share sigma and bias. Every variable has its own share of outliers. The estimate of the share counts one
+additional outlier and one additional good reading (the mode with a Beta(2, 2) prior).
 
-**Counts.** P(k | s) = (n(k, s) + a q(k | s)) / (n(s) + a): a Dirichlet prior with the weight of `a` readings
-in every cell; q is the table of the model or a uniform one. Likewise P(s) = (n(s) + a M q(s)) / (n + a M)
-for M cells.
+**Counts.** P(k | s) = (n(k, s) + a q(k | s)) / (n(s) + a). This is the mean with a Dirichlet prior that has the weight
+of `a` readings in every cell, where q is the model's table or a uniform table. For M cells, P(s) is estimated likewise
+as (n(s) + a M q(s)) / (n + a M).
 """
 
 import math
