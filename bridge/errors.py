@@ -134,12 +134,12 @@ class PathError(UsageError):
 
 
 class FieldMissingError(BridgeError):
-    """Raised when a message does not have a field; the sentence lists the fields that it has."""
+    """Raised when a message does not have a field. The error lists the fields of the message."""
 
     exit_code = 4
 
 
 class FieldAmbiguousError(BridgeError):
-    """Raised when a bare name occurs more than once in a message; the sentence lists the paths."""
+    """Raised when a bare name occurs more than once in a message. The error lists the paths of these fields."""
 
     exit_code = 4

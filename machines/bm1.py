@@ -151,17 +151,18 @@ class Start:
     """The registers that the host writes to start a frame.
 
     Attributes:
-        addresses: One address per sensor column, columns 1..N; a missing reading is the column's top address.
-            With inputs per cell or several replicas: an array of integers of shape `parameters.input_shape`,
-            addresses or (`threshold`) codes; all lines of a missing reading have the top value.
-        prior_address: Row of the prior's table; with replicas one row for all, or a tuple with one row for
-            each.
-        prior_codes: uint16[lines], a written prior (only with `prior_mode` = `written`); with replicas the
-            same for all, or uint16[replicas, lines]. None selects the row of the table.
+        addresses: One address per sensor column, columns 1..N. A missing reading has the column's top address.
+            If the machine has inputs per cell or several replicas, this is an array of integers of the shape
+            `parameters.input_shape`. The array contains addresses, or codes if `sensor_mode` is `threshold`. All
+            lines of a missing reading have the top value.
+        prior_address: Row of the prior's table. If the machine has replicas, an integer is the row of all replicas,
+            and a tuple has one row for each replica.
+        prior_codes: uint16[lines], a written prior, for a machine with `prior_mode` = `written`. An array
+            uint16[replicas, lines] has one prior for each replica. If None, the machine uses the row of the table.
         target_count: The count at which a line stops the machine, 1 to 2**counter_bits - 1.
         max_cycles: The frame's last cycle, 1 or more.
-        bank: Set of seeds from which the generators restart (`rng_reset` = `bank`); free generators ignore it.
-        run_until: Cycle at which the first slice ends; 0 for no slices.
+        bank: Set of seeds from which the generators restart. Generators with `rng_reset` = `free` ignore it.
+        run_until: Cycle at which the first slice ends, or 0 for a frame without slices.
     """
 
     addresses: tuple[int, ...] | npt.NDArray[np.integer]

@@ -396,7 +396,10 @@ class _OnHost(HostMachine):
         return worst, np.array(given, dtype="<u4").tobytes() if fits else b""
 
     def _input_words(self, inputs: npt.NDArray[np.integer]) -> list[bytes]:
-        """Return the words of INPUTS for each board; with inputs per cell, a board gets only those of its lines."""
+        """Return the words of the register block INPUTS for each board, or raise a StartError.
+
+        If the machine has inputs per cell, each board gets only the inputs of its own lines.
+        """
         parameters = self._parameters
         per_cell = parameters.sensor_mode is not SensorMode.COLUMN
         replicas, sensors, lines = self._replicas, parameters.sensors, self._total_lines

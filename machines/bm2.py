@@ -352,7 +352,9 @@ class BM2Machine(MachineContents):
         factors: Sequence[npt.ArrayLike],
         rng_table: npt.NDArray[np.uint32] | None = None,
     ) -> "BM2Machine":
-        """Return the machine of a product of factors, each a float64[cardinalities of its variables].
+        """Return the machine that samples from the product of the factors.
+
+        A factor is a float64 array with one axis per variable of the factor.
 
         Raises:
             ParameterError: A factor has a wrong shape, a negative or non-finite entry, or only zeros.

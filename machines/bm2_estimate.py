@@ -41,13 +41,13 @@ class ChainEstimate:
     """The estimate of a frame from the chains of all boards.
 
     Attributes:
-        posterior: float64[values], over the joint values of the searched variables; None if all boards are left out.
-        error: float64[values], the posterior's standard error; NaN where the effective samples are unknown. If boards
-            disagree, it is at least that of the mean of the boards' posteriors.
-        effective_samples: Sum over the boards, for the value with the smallest sum; NaN if unknown, for example if
-            all samples of a board have the same value.
-        r_hat: The largest R-hat of all values; NaN for a single board, or if a board has too few samples.
-        left_out: Indices of the boards that are left out, because they timed out or have no sample that counts.
+        posterior: float64[values], over the joint values of the searched variables, or None if all boards are left out.
+        error: float64[values], the standard error of the posterior. A value whose effective samples are unknown has the
+            error NaN. If boards disagree, the error is at least the standard error of the mean over the boards.
+        effective_samples: Number of effective samples, summed over the boards, for the value with the smallest sum. It
+            is NaN if it cannot be estimated, for example if all samples of a board have the same value.
+        r_hat: The largest R-hat of all values. It is NaN for a single board, or if a board has too few samples.
+        left_out: Indices of the boards that are left out. A board is left out if it timed out or no sample counts.
     """
 
     posterior: Floats | None

@@ -1,14 +1,14 @@
 """The fast BM2 for LFSRs, with the same results as the reference, bit for bit.
 
-A bit is written in the first cycle in which its CDEs agree. Until then the state does not change, and so the codes do
-not either. Each code is therefore compared with the random numbers of 32 cycles at a time, which gives a mask of 32
-bits, and the masks of the CDEs show the first cycle in which they agree.
+The machine writes a bit of the state in the first cycle in which the CDEs of this bit agree. Until then, neither the
+state nor the codes change. So the kernel compares each code with the random numbers of 32 cycles at a time. Each
+comparison gives a mask of 32 bits. The masks of a bit's CDEs show the first cycle in which these CDEs agree.
 
 The random numbers of a block of cycles are stored for each CDE. A generator's number in cycle t is the XOR of its
-numbers in the cycles t - e, for the exponents e of its polynomial. Reason: each bit of an LFSR's state goes through the
-LFSR's sequence, and every 2**k-th bit of that sequence is the same sequence at another phase (`steps_per_clock` is a
-power of two). For the same reason, the number in cycle t is also the XOR of those in the cycles t - 32 * e, so 32
-numbers are computed at a time.
+numbers in the cycles t - e, for the exponents e of its polynomial. This recurrence holds because each bit of an LFSR's
+state goes through the LFSR's sequence. Every 2**k-th bit of the sequence gives the same sequence at another phase. So
+the recurrence also holds for `steps_per_clock` > 1, because `steps_per_clock` is a power of two. As 32 is a power of
+two, the number in cycle t is also the XOR of the numbers in the cycles t - 32 * e. So 32 numbers are computed at once.
 """
 
 from functools import lru_cache, partial

@@ -320,15 +320,15 @@ class _OnBoard(BoardMachine):
 
 
 class Kept(msgspec.Struct, array_like=True):
-    """The record of one board's chain in a frame, in addition to its last result words.
+    """The record of one board's chain in a frame, in addition to the last result words of the board.
 
     Attributes:
         samples: Number of samples drawn so far.
         unused: Number of samples that no histogram counts.
-        timed_out_bit: The state bit on which the CDEs did not agree in time; -1 for none.
-        batches: Without a stream, the result words at the end of each batch; in a `BoardResult`, the last batch's
-            are left out.
-        stream: The sampled states, `state_words` words each.
+        timed_out_bit: The state bit on which the CDEs did not agree in time, or -1 if there is no such bit.
+        batches: The result words at the end of each batch, if the machine has no stream. In a `BoardResult`, the
+            words of the last batch are left out.
+        stream: The sampled states. Each state has `state_words` words.
     """
 
     parameters: BM2Parameters

@@ -1,4 +1,7 @@
-"""The reference BM2, which runs one cycle at a time as in the thesis; other kernels are tested against it."""
+"""The reference BM2, which runs one cycle at a time as in the thesis.
+
+The tests compare every other BM2 kernel with the reference.
+"""
 
 import numpy as np
 import numpy.typing as npt

@@ -30,7 +30,10 @@ def encode_probability(p: npt.ArrayLike, prob_bits: int) -> npt.NDArray[np.uint1
 
 
 def decode_code(codes: npt.ArrayLike, prob_bits: int) -> npt.NDArray[np.float64]:
-    """Return the probability of each code: code / 2**W, or 1 for all ones; a ParameterError if a code has more bits."""
+    """Return the probability of each code: code / 2**prob_bits, or 1 for the code of all ones.
+
+    Raises a ParameterError if a code has more than `prob_bits` bits.
+    """
     _check_bits(prob_bits)
     array = np.asarray(codes)
     ones = (1 << prob_bits) - 1

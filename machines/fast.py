@@ -1,13 +1,14 @@
 """The fast BM1 for shared LFSRs: 64 cycles per word, with the same results as the reference, bit for bit.
 
-The bits of a cell in 64 cycles are one word, which depends only on the generator of its column and on its
-code, so all cells of a column with the same code share it, in all replicas. A line ANDs the words of its
-cells and counts the ones. Lines with a code 0 cannot count and are omitted. Cycles are run in blocks of 512.
-If a counter reaches the target in a block, the exact cycle is found in the words of its line, and the
-block is counted again up to that cycle. Replicas are run one after the other, each to its own end.
+The bits of a cell in 64 cycles form one word. The word depends only on the cell's code and on the generator of the
+cell's column. So all cells of a column with equal codes share one word, in all replicas. The kernel ANDs the words of
+a line's cells, and counts the ones. A line with a code 0 cannot count, and is omitted.
 
-If frames restart from a bank, the words of a frame's first cycles are constants of the machine: they are
-cached for later frames with the same bank.
+Cycles are run in blocks of 512. If a counter reaches the target in a block, the words of the counter's line show the
+exact cycle. The kernel then counts the block again up to this cycle. Replicas are run one after the other.
+
+If each frame restarts the generators from a bank, the words of the first cycles depend only on the bank. The kernel
+caches these words for later frames.
 """
 
 from typing import Final

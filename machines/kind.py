@@ -5,8 +5,8 @@
     proceed(answers) ─ settings, blocks ───▶ resume ─▶ step, step, ... ─┤ until `proceed` resumes no board
     infer(results) ◀── results, cycles, reasons ────────────────────────┘
 
-Words of registers are exchanged by the name of their block in the register map. This folder knows the names, and what
-the words mean to a machine; `pcie_shim` knows the addresses.
+The register map gives each block of registers a name and an address. This folder uses only the names, and defines
+what the words of a block mean to a machine. `pcie_shim` translates the names to addresses.
 """
 
 from abc import ABC, abstractmethod
@@ -320,7 +320,9 @@ class MachineKind(ABC):
     def posterior(
         self, machines: Sequence[Any], frame: FrameInput, variables: Sequence[str] = ()
     ) -> tuple[npt.NDArray[np.float64], Mapping[str, str]]:
-        """Run the machines of all boards in this process, each to its own stop; return the posterior and the details.
+        """Run the machines of all boards in this process, and return the posterior with details about it.
+
+        Each machine runs until it stops by itself.
 
         Raises:
             NoPosteriorError: The readings give no posterior.

@@ -79,28 +79,29 @@ def posterior(
     max_cycles: int = 2**17,
     bank: int = 0,
 ) -> npt.NDArray[np.float64]:
-    """Run one machine, without boards or processes, and return the posterior for its readings (thesis 2.1.2).
+    """Run a machine in this process, without boards, and return the posterior for its readings (thesis 2.1.2).
 
     Args:
-        machine: The machine to run, or the machines of all boards, in the order of their lines: then each
-            machine gets the same readings, and stops at its own cycle.
-        readings: One address per sensor column, columns 1..N; None for a missing reading. With inputs per
-            cell (`sensor_mode`), the reading of a column is a row with one address, or one code, per line.
-            With several replicas, a list with the readings of each replica. If no reading is missing, this may
-            be one array of integers of shape `machine.parameters.input_shape`.
-        prior_address: Row of the prior's table; with replicas one for all, or a tuple with one for each.
-        prior_codes: uint16[lines], a written prior, if the machine uses one; with replicas the same for all,
-            or uint16[replicas, lines].
+        machine: The machine to run, or a list of the machines of all boards, in the order of their lines. Machines
+            in a list get the same readings, and each stops at its own cycle.
+        readings: One address per sensor column, columns 1..N, or None for a missing reading. If the machine has inputs
+            per cell (`sensor_mode`), a reading is a row with one address or one code per line. If the machine has
+            several replicas, pass a list with the readings of each replica. If no reading is missing, one array of
+            integers of shape `machine.parameters.input_shape` is accepted instead.
+        prior_address: Row of the prior's table. If the machine has replicas, an integer is the row of all replicas,
+            and a tuple has one row for each replica.
+        prior_codes: uint16[lines], a written prior, if the machine uses one. An array uint16[replicas, lines] has one
+            prior for each replica.
         target_count: The count at which the best line stops the machine.
         max_cycles: Maximum number of cycles.
-        bank: Set of seeds; each set gives another draw from the same distribution.
+        bank: Index of a set of seeds. Each set gives another draw from the same distribution.
 
     Returns:
-        float64[lines] with the sum 1. With several replicas float64[replicas, lines]; the row of a replica
-        without a posterior is 0.
+        float64[lines] with the sum 1, or float64[replicas, lines] for several replicas. The row of a replica without
+        a posterior contains zeros.
 
     Raises:
-        NoPosteriorError: All counts (of all replicas) are 0 for these readings.
+        NoPosteriorError: All counts of all replicas are 0 for these readings.
         StartError: A reading or another argument does not fit the machine.
     """
     from machines import make_kernel

@@ -229,8 +229,8 @@ class Subscription(Handle):
         """Wait for one message, at most `timeout` seconds.
 
         Raises:
-            NoMessageError: No message arrived in time. The text names topic, server and time, and what rosapi
-                knows about the topic (asking it takes up to half a second more).
+            NoMessageError: No message arrived in time. The error names the topic, the server, the timeout and the
+                probable reason. To find the reason, rosapi may be asked, for up to half a second more.
             TopicLeftOutError: The topic's messages are too large for the connection.
             DisconnectedError: The subscription or the client is closed.
             ConcurrentReadError: Another task is already waiting.

@@ -253,10 +253,11 @@ class Ros:
 
         Args:
             service: Name of the service.
-            type: Its type, in the form of ROS 1 or ROS 2.
-            handler: Coroutine function that is called with the fields of each request and returns the fields
-                of the answer. If it raises `ServiceError`, the caller gets its reason; any other error is
-                logged, and the caller gets its name. Up to 64 requests are handled concurrently.
+            type: Type of the service, in the form of ROS 1 or ROS 2.
+            handler: Coroutine function that gets the fields of a request and returns the fields of the answer.
+                If the handler raises a `ServiceError`, the caller gets the reason of the `ServiceError`. Any other
+                error is logged, and the caller gets the name of the error. Up to 64 requests are handled
+                concurrently.
             handler_timeout: Timeout of the handler in seconds.
 
         Raises:

@@ -57,10 +57,12 @@ def make_route(
     ca_file: Path | None = None,
     tls: ssl.SSLContext | None = None,
 ) -> Route:
-    """Check the options of a route (see `bridge.client.connect`); credentials in the URI become a header.
+    """Check the options of a route (see `bridge.client.connect`), and return the route.
+
+    Credentials in the URI become a header of the handshake.
 
     Raises:
-        OptionError: An option is invalid; the sentence names it, without secrets.
+        OptionError: An option is invalid. The error names the option, but shows no secret.
     """
     # Only one source of credentials, because a server could use either of two.
     fields = dict(headers or {})

@@ -444,7 +444,10 @@ class Session:
         return websocket
 
     def send_now(self, data: bytes) -> None:
-        """Write a message to the socket; call it after `must_wait` or `wait_turn`, without an `await` in between."""
+        """Write a message to the socket.
+
+        Call `must_wait` or `wait_turn` before, without an `await` between the two calls.
+        """
         (self._websocket or self._connected()).send((data,))
         if len(data) > self._largest_sent:  # noqa: PLR1730 - `max` takes ten times as long
             self._largest_sent = len(data)

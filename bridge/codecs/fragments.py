@@ -85,12 +85,12 @@ class Reassembler:
         return min((begun.touched for begun in self._sets.values()), default=math.inf) + MAX_AGE
 
     def take(self, fragment: Mapping[str, Any], now: float) -> bytes | None:
-        """Add one fragment; `now` is in seconds of any monotonic clock.
+        """Add one fragment at the time `now`, in seconds of any monotonic clock.
 
-        Returns the complete message; None if fragments are missing, or this one is a duplicate.
+        Returns the complete message, or None if fragments are missing or `fragment` is a duplicate.
 
         Raises:
-            DecodeError: It is not a fragment, or its message is too large or inconsistent and was discarded.
+            DecodeError: `fragment` is malformed, or its message is too large or inconsistent and was discarded.
         """
         key, data, number, total = _read(fragment)
         self.expire(now)

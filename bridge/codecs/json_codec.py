@@ -77,15 +77,15 @@ def text_of(value: Any) -> str:
 
 
 def decode(data: bytes, *, max_size: int = MAX_SIZE, max_depth: int = MAX_DEPTH) -> dict[str, Any]:
-    """Read one message.
+    """Decode a WebSocket message that contains a JSON object.
 
     Args:
-        data: A whole WebSocket message.
+        data: The whole message.
         max_size: Maximum number of bytes.
-        max_depth: Maximum nesting of objects and arrays, including the outermost.
+        max_depth: Maximum nesting depth of objects and arrays. The outermost object has depth 1.
 
     Returns:
-        The object, with finite numbers only.
+        The object. All its numbers are finite.
 
     Raises:
         DecodeError: The data is too large, too deep, or not a JSON object.

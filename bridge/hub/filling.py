@@ -44,9 +44,10 @@ class Filler:
         """Prepare a type.
 
         Args:
-            defaults: The defaults of all fields, which must not be changed.
-            varying: Defaults that differ from message to message: stamps, and a time's fields of the other ROS version.
-            parts: The fields that are messages, or arrays of messages, with their fillers.
+            defaults: The default of each field. The defaults must not be changed.
+            varying: Functions that compute a default from the message, by field. Such fields are stamps, and the
+                fields of a time with the names of the other ROS version.
+            parts: The fields that contain a message or an array of messages, each with its filler.
             is_time: Whether the type is a time or a duration.
         """
         self._defaults = defaults

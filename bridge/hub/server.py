@@ -4,12 +4,12 @@
                               └─▶ _Hub.serve ─▶ Broker.take_ready ─▶ _Connection.flush of each ─▶ asyncio
     timers ──▶ _Hub._wake ─▶ Broker.wake ─▶ outboxes;   _Hub.sweep ─▶ silent and stuck connections
 
-Connections do not have tasks: messages are read, brokered and written to all subscribers within one callback
-of the event loop, with one write per subscriber. Data is not compressed, because on loopback that costs more
-than it saves.
+Connections do not have tasks. One callback of the event loop reads the messages, passes them through the broker,
+and writes them to all subscribers, with one write per subscriber. Data is not compressed, because compression on
+loopback costs more time than it saves.
 
-Messages that a socket does not accept wait in its client's outbox, which drops the oldest; other clients are
-not delayed.
+If a client's socket accepts no more bytes, messages wait in the outbox of this client. A full outbox drops its oldest
+message. Other clients are not delayed.
 """
 
 import asyncio

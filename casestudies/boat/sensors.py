@@ -1,11 +1,11 @@
 """The boat's map, its sensors with their noise, and their ROS messages.
 
-This is the boat localisation problem of thesis 2.1.2.1 with the numbers of its published version (Bessiere et al.,
-Bayesian Programming, ch. 7). Distances are in map units, bearings in degrees.
+The problem is the localisation of a boat from thesis 2.1.2.1. The numbers are from its published version (Bessiere et
+al., Bayesian Programming, ch. 7). Distances are in map units, and bearings are in degrees.
 
-Messages with named fields (`boat_msgs/Raw`, `boat_msgs/Sensors`) are easy to read and carry a time stamp. A ROS
-server accepts only types of installed packages; to one without `boat_msgs`, the same readings are sent as
-std_msgs/Float64MultiArray, in the order of `SENSOR_NAMES`.
+The messages `boat_msgs/Raw` and `boat_msgs/Sensors` have named fields and a time stamp. But a ROS server accepts only
+types of installed packages. To a server without `boat_msgs`, the readings are sent as std_msgs/Float64MultiArray, in
+the order of `SENSOR_NAMES`.
 """
 
 import math

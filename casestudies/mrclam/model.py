@@ -64,19 +64,20 @@ def model(
     bearing_values: int = 255,
     fit: Path | None = None,
 ) -> Model:
-    """Return the model of a robot's position, in metres, given its sightings of landmarks.
+    """Return the model of a robot's position, in metres, given the robot's sightings of landmarks.
 
     Args:
-        landmarks: A CSV file with the columns landmark, x_m, y_m; the data set's README says where to get it.
-        width: Cells along x in [-2, 7] m.
-        height: Cells along y in [-7, 7] m.
-        floor: Likelihood of an outlier at every reading, relative to that of the most likely reading. Codes of
-            8 bits round 1e-3 to 0, and then a single outlier makes every line impossible.
-        range_step: Metres between distinguishable ranges, from 0; longer ranges are clamped.
+        landmarks: A CSV file with the columns landmark, x_m and y_m. The README of the data set says where to get it.
+        width: Number of cells along x in [-2, 7] m.
+        height: Number of cells along y in [-7, 7] m.
+        floor: Smallest likelihood of a reading, relative to the most likely reading. The floor allows for outliers.
+            Codes of 8 bits round a floor of 1e-3 to 0. A single outlier then makes every line impossible.
+        range_step: Step between distinguishable ranges, in metres. The smallest range is 0; longer readings than the
+            largest range are clamped.
         range_values: The number of distinguishable ranges.
-        bearing_values: The number of distinguishable bearings in a turn; readings are radians, plus any number of
-            turns.
-        fit: A file written by `toolchain fit`, whose sigmas and outliers replace those set by hand.
+        bearing_values: The number of distinguishable bearings in a turn. Readings are in radians, and may include
+            whole turns.
+        fit: A file written by `toolchain fit`. Its sigmas and outliers replace the values set by hand.
 
     Raises:
         ModelError: The file does not contain landmarks, or a size is not positive.

@@ -93,7 +93,10 @@ async def words_of_a_long_register_are_written_one_by_one(dut: Any) -> None:
 
 @cocotb.test()
 async def a_reset_is_a_pulse(dut: Any) -> None:
-    """Write CONTROL: the reset lasts one clock and reads as 0; the interrupt bit keeps its value."""
+    """Check that a write to CONTROL sets the reset bit for one clock, and that the interrupt bit remains set.
+
+    The reset bit always reads as 0.
+    """
     block = Block(dut)
     await block.start()
     await block.write(rm.CONTROL, rm.CONTROL_RESET_MASK | rm.CONTROL_INTERRUPT_ENABLE_MASK)

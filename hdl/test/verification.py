@@ -18,11 +18,11 @@ _OPTIONS: Final = ("-gMEMORY_FOLDER=Memory_MIFs/",)
 
 @dataclass(frozen=True)
 class Check:
-    """One check.
+    """One check of the VHDL.
 
     Attributes:
-        kind: `session`, `unit` or `proof`.
-        what: Seed of a session, module of a bench, or name of a proof.
+        kind: Kind of the check: `session`, `unit` or `proof`.
+        what: The seed of the session, the module of the unit's bench, or the name of the proof.
     """
 
     kind: str

@@ -1,6 +1,7 @@
-"""The rosbridge client as a state machine without sockets and clocks: bytes and times in, events and bytes out.
+"""The rosbridge client as a state machine: bytes and times go in, events and bytes come out.
 
-A connection, as the core sees it (`->` is what `ClientCore.data_to_send` returns, `<-` what `ClientCore.receive` gets):
+The state machine has no socket and no clock. In this example of a connection, `->` marks bytes that
+`ClientCore.data_to_send` returns, and `<-` marks bytes that are passed to `ClientCore.receive`:
 
     restore()            ->  {"op": "advertise", "id": "advertise:/cmd:1", "topic": "/cmd", "type": "p/Cmd", ...}
                          ->  {"op": "advertise_service", "service": "/stop", "type": "p/Stop"}
@@ -12,14 +13,15 @@ A connection, as the core sees it (`->` is what `ClientCore.data_to_send` return
     ServiceRequested     <-  {"op": "call_service", "id": 7, "service": "/stop", "args": {}}
     services.answer()    ->  {"op": "service_response", "id": 7, "service": "/stop", "values": {}, "result": true}
     unsubscribe()        ->  {"op": "unsubscribe", "id": "subscribe:/pose:2", "topic": "/pose"}
-    lost()                   drops calls, goals and requests; keeps everything else for restore()
+    lost()                   drops calls, goals and requests, and keeps everything else for restore()
 
-rosbridge has no handshake and no acknowledgements: at most, a server reports a refused operation in a status message.
-So the core stores what the program wants, and sends all of it again on a new connection. Messages may also be encoded
-as CBOR, or in fragments. Goals of actions work like calls, with feedback before the result.
+rosbridge has no handshake and no acknowledgements. If a server refuses an operation, it sends a status message at
+most. So the core stores the program's subscriptions, advertisements and services, and sends them again on a new
+connection. Messages may also be encoded as CBOR, or be split into fragments. The goal of an action works like a call,
+with feedback before the result.
 
-Source: the rosbridge protocol, version 2 (https://github.com/RobotWebTools/rosbridge_suite), and
-the deviations of servers from it (`docs/reference/rosbridge-differences.md`).
+Source: the rosbridge protocol, version 2 (https://github.com/RobotWebTools/rosbridge_suite). Servers deviate from the
+protocol as described in `docs/reference/rosbridge-differences.md`.
 """
 
 from bridge.client.protocol.client_core import ClientCore
