@@ -21,7 +21,7 @@ GREET: Final = 1
 READ: Final = 2
 """Host to board: read `count` words, starting at `address`. The reply contains the words."""
 WRITE: Final = 3
-"""Host to board: write the payload from `address` on; acknowledged, unless posted."""
+"""Host to board: write the payload from `address` on. The board acknowledges a WRITE without the flag POSTED."""
 IRQ: Final = 4
 """Board to host: the machine has stopped.
 
@@ -157,10 +157,10 @@ class Greeting(NamedTuple):
     Attributes:
         protocol_version: Version of the wire format.
         bar_size: Size of the register map, in bytes.
-        board: Index of the board, which its server got when it was started.
+        board: Index of the board, given to the board's server when it is started.
         map_hash: SHA-256 (hex) of the register map's definition.
-        image_hash: SHA-256 (hex) of the loaded image; all zeros on a blank board.
-        token: Token that proves to the programming port that its sender holds this link.
+        image_hash: SHA-256 (hex) of the loaded image. A blank board sends zeros.
+        token: Token of this link. A loader sends the token to the programming port, to prove that it holds the link.
     """
 
     protocol_version: int

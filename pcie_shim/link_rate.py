@@ -28,7 +28,10 @@ def wait_until(tick_ns: int) -> None:
 
 
 class LinkModel:
-    """The wire to a board; a shared wire leads to all boards whose processes are forked after its creation."""
+    """The wire to a board.
+
+    A shared wire leads to several boards: to all boards whose processes are forked after the wire's creation.
+    """
 
     def __init__(self, wire: LinkFigures, wait: Callable[[int], None] = wait_until) -> None:
         self._wire = wire

@@ -1,6 +1,7 @@
-"""Pairing of posteriors with the reports of their frames.
+"""Pairing of the posteriors on `/BMresults` with the reports on `/bm/frame`.
 
-`/BMresults` has no stamp; the `/bm/frame` sent just before it contains the stamp of the reading.
+A posterior on `/BMresults` has no stamp. The publisher sends the report of a frame just before the frame's posterior,
+and the report contains the stamp of the reading.
 """
 
 from collections import deque

@@ -26,7 +26,10 @@ _LONGEST: Final = 8
 
 
 def _plane(axes: Sequence[Axis], values: NDArray[Any]) -> tuple[list[Axis], NDArray[np.float64], list[str]]:
-    """Return the one or two longest axes, their marginal, and the other axes' labels; an axis `x` comes after `y`."""
+    """Return the axes to draw, the marginal over these axes, and the labels of the other axes.
+
+    The one or two longest axes are drawn. Axes `x` and `y` are returned in the order y, x.
+    """
     kept = sorted(sorted(range(len(axes)), key=lambda at: -axes[at].size)[:2])
     others = tuple(at for at in range(len(axes)) if at not in kept)
     drawn, marginal = [axes[at] for at in kept], values.sum(axis=others)

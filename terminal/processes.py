@@ -30,9 +30,10 @@ _PR_SET_NAME: Final = 15
 
 
 def own_command(name: str) -> list[str]:
-    """Return the command line of one of our commands in this environment; a `name` that is a path stays as it is.
+    """Return the command line that runs one of our commands in this environment.
 
-    PATH is not searched, because other software has commands of the same names.
+    If `name` is a path, it is returned unchanged. PATH is not searched, because other software has commands with the
+    names of ours.
     """
     if "/" in name:
         return [name]
@@ -96,10 +97,10 @@ def fork_command(
     kept: Collection[int] = (),
     variables: Mapping[str, str] | None = None,
 ) -> Forked:
-    """Run one of our commands in a fork of this process, which has already loaded most of the command's modules.
+    """Run one of our commands in a fork of this process, where most of the command's modules are already loaded.
 
-    It runs as if it had been executed: in its own session, without standard input, and with no open descriptors but
-    `output` (/dev/null if None), `errors` and those in `kept`.
+    The command runs in its own session, with /dev/null as standard input. `output` becomes its standard output
+    (/dev/null if None), and `errors` its standard error. Of all other descriptors, only those in `kept` stay open.
     """
     return fork(partial(_run_command, name, arguments, output, errors, kept, variables or {}))
 

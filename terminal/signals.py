@@ -97,9 +97,10 @@ async def until_one_ends(*work: Coroutine[Any, Any, object]) -> None:
 
 
 def run_async(main: Coroutine[Any, Any, int | None]) -> int:
-    """Run a coroutine on uvloop, and return its exit code; raise a StoppedError if a signal cancelled it.
+    """Run a coroutine on uvloop, and return the coroutine's exit code.
 
-    Its `finally` clauses clean up before this function returns.
+    If a signal arrives, the coroutine is cancelled and a StoppedError is raised. The coroutine's `finally` clauses
+    always run before this function ends.
     """
 
     async def guarded() -> int:

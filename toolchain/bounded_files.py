@@ -86,8 +86,8 @@ Model = TypeVar("Model", bound=BaseModel)
 _MOST_BYTES: Final = 4 << 20
 """Maximum size of a configuration file in bytes; a deployment has a few kilobytes."""
 _MOST_SIGNS: Final = 100_000
-"""Maximum number of `[`, `{` and `=` in a file, together. Tables and keys need a thousand times as much memory as
-their text; a deployment of 4,096 boards has 30,000 of these characters.
+"""Maximum number of `[`, `{` and `=` in a file, together. The number is limited because tables and keys need a thousand
+times as much memory as their text. A deployment of 4,096 boards has 30,000 of these characters.
 """
 _MOST_PARTS: Final = 32
 """Maximum number of parts of a dotted key; valid files have at most two."""

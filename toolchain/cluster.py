@@ -267,10 +267,12 @@ def _noticing_loss() -> Iterator[None]:
 def _on_scheduler(
     address: str, connect: Callable[[], Any], job: Job, numbers: Sequence[int], keep: Keep
 ) -> None:
-    """Do the pieces on the workers of a scheduler; if it is lost, go on when a scheduler answers at this address again.
+    """Do the pieces of a job on the workers of a scheduler.
+
+    If the scheduler is lost, the job continues when a scheduler answers at `address` again.
 
     Raises:
-        ClusterError: The workers cannot do the pieces, or there is no scheduler or worker for a minute.
+        ClusterError: The workers cannot do the pieces, or for a minute there is no scheduler or no worker.
     """
     left = dict.fromkeys(numbers)  # the numbers without a result, in order
     until = 0.0  # monotonic time until which to wait after a loss; 0 before the first

@@ -4,9 +4,9 @@
                                  ├─ one epoll loop ─── board (registers, machine)
     loader ──▶ programming port ─┘
 
-The loop polls its sockets between two chunks of the machine, so a reset, a second host or the end of the
-process never waits longer than one chunk. When a host disconnects, the board is free for the next one. A host
-that violates the protocol gets an ERROR, and its link is closed.
+The machine runs in chunks of cycles, and the loop polls its sockets after each chunk. So a reset, a second host or the
+end of the process never waits longer than one chunk. When a host disconnects, another host can open the board. If a
+host violates the protocol, the server sends an ERROR and closes the link.
 """
 
 import hashlib

@@ -68,15 +68,17 @@ def thrml_gibbs(
     sweeps: int,
     burn_in: int,
 ) -> Sampled:
-    """Run THRML's block Gibbs sampler: 64 chains of sweeps/64 sweeps, all from `start`; compilation is not timed.
+    """Run THRML's block Gibbs sampler with 64 chains of sweeps/64 sweeps, all from `start`.
+
+    The compilation is not timed.
 
     Args:
         factors: The network.
-        start: The value of each variable in a possible state.
+        start: A possible state of the network: the value of each variable.
         known: The evidence.
-        colours: The colour of each variable; variables of one colour share no factor, and are drawn together.
-        sweeps: The number of sweeps of all chains.
-        burn_in: The number of sweeps of each chain before those that count.
+        colours: The colour of each variable. Variables of one colour share no factor, and are drawn together.
+        sweeps: The number of sweeps of all chains together, without the burn-in.
+        burn_in: The number of first sweeps that each chain discards.
     """
     import jax
     from jax import numpy as jnp

@@ -81,7 +81,7 @@ def check_disparity(installed: Installed) -> None:
 
 
 def check_page(installed: Installed) -> None:
-    """Check that a demo with the page, whose packages are missing, says before its start what to install."""
+    """Check that `demo --dashboard` does not start without the dashboard's packages, and prints how to install them."""
     said = installed.run("rosbayes", "demo", "--dashboard", "--out", "page", code=2)
     expect("pip install 'rosbayes[dashboard]'" in said, f"it does not say what to install: {said}")
     expect(not (installed.out / "page").exists(), "it has started")

@@ -26,7 +26,10 @@ class BoardAwayError(BoardError):
 
 
 def driver_input(deployment: Deployment, frame: FrameRequest, stop: str) -> FrameInput:
-    """Return the driver's input for a frame, or raise a FrameInputError; `stop` is the setting: `slices` or `own`."""
+    """Return the driver's input for a frame, or raise a FrameInputError.
+
+    `stop` is the value of the setting of the same name: `slices` or `own`.
+    """
     machine = deployment.machine
     prior = np.frombuffer(frame.prior_codes, "<u2") if frame.prior_codes else None
     addresses: tuple[int | None, ...] | npt.NDArray[np.int64]

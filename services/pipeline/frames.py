@@ -173,12 +173,16 @@ class FrameAssembler:
     def take(
         self, source: int, message: dict[str, Any], received_ns: int, received_tick: int
     ) -> list[Reading]:
-        """Add a message of a source (its index), and return the readings that are now complete.
+        """Add a message of a source, and return the readings that are now complete.
 
-        `received_ns` and `received_tick` are the time of its receipt, in ns of Unix time and of the monotonic clock.
+        Args:
+            source: Index of the source.
+            message: The message's fields.
+            received_ns: Time of the message's receipt, in ns of Unix time.
+            received_tick: Time of the message's receipt, in ns of the monotonic clock.
 
         Raises:
-            VariableError: A variable is missing or unusable; the sentence names topic and variable.
+            VariableError: A variable is missing or unusable. The error names the topic and the variable.
         """
         stamp_ns = header_stamp_ns(message)
         now_ns, tick = received_ns, received_tick

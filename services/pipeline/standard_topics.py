@@ -57,8 +57,8 @@ class StandardTopics:
     """The topics for robot tools on one server.
 
     Attributes:
-        advertised: The topics that are published, once `open` has advertised them.
-        refused: Names of topics that the server refuses according to the last check; nothing is published on them.
+        advertised: The topics that are published. The list is empty until `open` has advertised the topics.
+        refused: Names of the topics that the server refused at the last check. Nothing is published on these topics.
     """
 
     def __init__(self, settings: Settings, deployment: Deployment, role: str) -> None:

@@ -67,7 +67,7 @@ async def print_addresses(settings: Settings, deployment: Deployment, count: int
     arrived: asyncio.Queue[tuple[int, Message]] = asyncio.Queue(RECEIVED_QUEUE)
 
     async def next_readings() -> list[Reading]:
-        """Return the readings that the next message completes, or those whose deadline passes before it arrives."""
+        """Wait for the next message or the next deadline, and return the readings that are complete then."""
         deadline = frames.deadline
         wait = None if deadline is None else max(deadline - time.monotonic_ns(), 0) / 1e9
         # only a set that waits for a topic that may be missing has a deadline

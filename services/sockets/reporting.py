@@ -91,10 +91,10 @@ class ServiceManager:
 
 
 class Report:
-    """The status of a process with its identity, rate, CPU time, memory and latencies.
+    """The status of a process, with its identity, rate, CPU time, memory and latencies.
 
-    `is_alive` returns whether the process makes progress; it is needed only if an answer does not prove that.
-    `stages` returns the latencies of the stages of the process's frames.
+    `is_alive` returns whether the process makes progress. Omit `is_alive` if an answer of the process already proves
+    progress. `stages` returns the latencies of the stages that a frame passes in the process.
     """
 
     def __init__(

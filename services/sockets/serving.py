@@ -1,6 +1,8 @@
-"""The services of a run, and their side of a local socket, which serves one master at a time.
+"""The services of a run, and the side of a local socket that is in the service.
 
-master ──connects──▶ service   a second one is refused with `Trouble`
+A service accepts one master at a time:
+
+master ──connects──▶ service   a second master is refused with `Trouble`
        ◀───Hello────           role, version, deployment
        ────Hello───▶           a difference is refused with `Trouble`
        ◀─Notice, Ready         stored notices, and lasting states

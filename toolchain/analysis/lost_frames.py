@@ -99,7 +99,11 @@ def _share(chances: NDArray[np.float64], options: BuildOptions, cycles: int) -> 
 
 
 def _advice(plan: MachinePlan, drawn: Readings) -> str:
-    """Return advice: the options that save enough frames, each alone; else all together, or all with fewer sensors."""
+    """Return advice: the options with which few enough frames are lost.
+
+    If some options are enough by themselves, the advice lists each of them. If none is enough, the advice combines all
+    options. If the combination is not enough either, the advice also omits sensors.
+    """
     options, sensors = plan.options, len(plan.model.known)
     may_scale = options.sensor_mode is SensorMode.COLUMN and options.scaling is not Scale.ADDRESS
     rng: dict[str, Any] = {"rng": RngKind.LFSR32} if options.rng.lfsr_bits not in {None, 32} else {}

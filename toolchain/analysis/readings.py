@@ -30,13 +30,13 @@ class Readings:
     """Frames of readings.
 
     Attributes:
-        source: Their origin, as a clause.
-        addresses: int64[frames, sensors], in the order of the columns; `MISSING` for a missing reading. If
-            lines have their own readings, int64[frames, sensors, lines].
-        prior_addresses: int64[frames], the row of the prior; `MISSING` if none is selected.
-        codes: uint16[frames, sensors, lines], the codes of these readings' likelihoods, for a machine without tables
-            (`sensor_mode = threshold`); None for other machines.
-        lines: int64[frames], the true line of each; None if unknown.
+        source: Origin of the readings, as a clause.
+        addresses: int64[frames, sensors], in the order of the columns, or int64[frames, sensors, lines] if lines have
+            their own readings. A missing reading is `MISSING`.
+        prior_addresses: int64[frames], the row of the prior for each frame, or `MISSING` if no row is selected.
+        codes: uint16[frames, sensors, lines], the codes of the readings' likelihoods, for a machine without tables
+            (`sensor_mode = threshold`). For other machines, `codes` is None.
+        lines: int64[frames], the true line of each frame, or None if it is unknown.
     """
 
     source: str

@@ -163,7 +163,10 @@ FILL: Final = 0
 
 
 def replica_count(text: str) -> int:
-    """Parse the value of `--replicas`: a number, or FILL; click passes the default as a number, not as text."""
+    """Return the number that the value of `--replicas` means, or FILL for `fill`.
+
+    Click passes the default as a number, not as text.
+    """
     if text == "fill":
         return FILL
     if re.fullmatch(r"\d{1,3}", str(text), re.ASCII) and 1 <= int(text) <= REPLICAS_MAX:

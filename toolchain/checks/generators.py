@@ -109,7 +109,11 @@ def _relations(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def _table_numbers(machine: CheckedMachine, numbers: NDArray[np.uint32]) -> Iterator[Finding]:
-    """Find codes whose frequency a table of random numbers distorts, and columns that read it from the same index."""
+    """Find the mistakes that a table of random numbers causes.
+
+    The table may distort the frequency of a code. Two columns may read the table from one index, or from two indices
+    at which their random numbers correlate.
+    """
     parameters, names = machine.parameters, machine.names
     codes = 1 << parameters.prob_bits
     # codes 0 and all-ones don't depend on the random numbers

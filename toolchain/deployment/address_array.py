@@ -82,15 +82,17 @@ MISSING: Final = -1
 
 
 def to_addresses(deployment: Deployment, variable: Variable, value: object) -> list[int] | None:
-    """Return the addresses (`threshold`: codes) of one variable's readings in a frame; None if all are missing.
+    """Return the addresses of one variable's readings in a frame, or None if all readings are missing.
 
-    The value of the field is a flat array, or one with the shape `deployment.reading_shape(variable)`; an
-    array `uint8[]` may be bytes or base64 text. If it is `None` or an empty array, all readings are missing; a null
-    or NaN in it is one missing reading. There is one address per element of the array, row by row; a missing reading
-    has `MISSING` on all lines.
+    There is one address per element of the array, row by row. For a missing reading, the address is `MISSING` on all
+    lines. If the machine's `sensor_mode` is `threshold`, a sensor has codes instead of addresses.
+
+    `value` is the value of the field: a flat array, or an array of the shape `deployment.reading_shape(variable)`. An
+    array `uint8[]` may be bytes or base64 text. A null or NaN in the array is one missing reading. If `value` is `None`
+    or an empty array, all readings are missing.
 
     Raises:
-        ReadingError: The array has another length, or contains an unusable reading, which the error names.
+        ReadingError: The array has a wrong length or contains an unusable reading. The error names the reading.
     """
     machine = deployment.machine
     shape = deployment.reading_shape(variable)

@@ -194,7 +194,7 @@ class Section(BaseModel):
 
 
 class ModelSection(Section):
-    """`[model]`: the flags with which the build read the model; later commands with `--model` use them again."""
+    """`[model]`: the flags with which the build read the model. Later commands with `--model` use the same flags."""
 
     settings: Sequence[str] = ()
     bits: Sequence[str] = ()

@@ -104,16 +104,17 @@ class JointDistribution:
         """Return the question P(searched | known).
 
         Args:
-            searched: The searched symbols, the slowest dimension first; each combination of values is a line of the
-                machine.
+            searched: The searched symbols, the slowest dimension first. Each combination of their values is a line of
+                the machine.
             known: The symbols known in every frame, in the order of the machine's columns.
-            given: Symbols with a fixed value, by name: the label or number of the value.
-            prior_select: A known symbol that selects the prior instead of being a column (thesis 2.1.2).
-            previous: For a filter: the searched symbols one frame earlier, in the same order. The arcs from them are
-                the transition, and their own distribution is P(S) before the first frame.
+            given: The fixed value of each symbol that has one, by name. A value is given by its label or number.
+            prior_select: A known symbol that selects the row of the prior. It has no column (thesis 2.1.2).
+            previous: For a filter: the searched symbols one frame earlier, in the order of `searched`. The arcs from
+                the earlier to the searched symbols are the transition. The distribution of the earlier symbols is P(S)
+                before the first frame.
 
         Raises:
-            ModelError: A symbol does not exist, or is in the question twice.
+            ModelError: A symbol does not exist or is in the question twice, or no symbol is searched.
         """
         fixed = {
             self.symbol(name).name: self.symbol(name).index(label) for name, label in (given or {}).items()

@@ -1,8 +1,8 @@
 """A clock that can be stepped, for processes that have this folder in PYTHONPATH.
 
-libfaketime is not suitable: if it changes the monotonic clock too, waits change their length; if it does not,
-Python's sleep fails. The offset is read from shared memory, because a process without free descriptors must also know
-the time.
+libfaketime is not suitable in either of its modes. If it also changes the monotonic clock, waits change their length.
+If it changes only the time of day, Python's sleep fails. The offset of the clock is read from shared memory, because a
+process without free descriptors must also be able to read the time.
 """
 
 import mmap
