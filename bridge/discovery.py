@@ -156,9 +156,11 @@ async def announced(
 ) -> AsyncIterator[None]:
     """Announce a rosbridge server while the context is open.
 
-    `host` is the address on which the server listens; `0.0.0.0` and `::` mean all addresses of this machine,
-    and a loopback address is announced only to this machine. With `tls`, clients get the host name of this
-    machine, which must be in the certificate; `token` says whether clients need a token.
+    `host` is the address on which the server listens. `0.0.0.0` and `::` stand for all addresses of this machine.
+    A loopback address is announced only to this machine.
+
+    With `tls`, clients get the host name of this machine, and the certificate must contain this host name. `token`
+    says whether clients need a token.
 
     Raises:
         DiscoveryError: `zeroconf` is not installed, there is no network, or another server has the name.
@@ -247,7 +249,7 @@ async def _zeroconf(interfaces: list[str] | None = None) -> AsyncIterator[AsyncZ
 
 
 async def _ask(zeroconf: AsyncZeroconf, full_name: str, patience: float) -> Robot | None:
-    """Query a robot; return None if it does not answer in time, or its answer is unusable."""
+    """Query a robot. Return the robot, or None if no usable answer arrives within `patience` seconds."""
     from zeroconf import BadTypeInNameException
     from zeroconf.asyncio import AsyncServiceInfo
 

@@ -395,10 +395,11 @@ class BM2Start:
 def cde_table(factor: npt.NDArray[np.float64], prob_bits: int) -> npt.NDArray[np.uint16]:
     """Return a CDE's table (`BM2Machine.tables`), from the odds factor(bit = 1) / factor(bit = 0) of each bit.
 
-    A variable's codes beyond its cardinality, up to the next power of two, are unused. Between a used and an unused
-    code, the odds favour the used one as far as a table can; if both are unused, or another variable is at an unused
-    code, the odds are 1. The factor is float64[cardinalities of the variables]; for n bits, the result is
-    uint16[n * 2**(n - 1)].
+    The factor is float64[cardinalities of the variables]. For n bits, the result is uint16[n * 2**(n - 1)].
+
+    A variable's codes beyond its cardinality, up to the next power of two, are unused. If a bit decides between a
+    used and an unused code, the odds favour the used code as far as a table can. If both codes are unused, the odds
+    are 1. The odds are also 1 if another variable has an unused code.
     """
     # NaN at unused codes: what is computed with one is NaN, too
     padded = np.full([1 << (cardinality - 1).bit_length() for cardinality in factor.shape], np.nan)

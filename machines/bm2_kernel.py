@@ -98,7 +98,7 @@ class BM2Kernel(ABC):
         """Empty the stream's buffer, and continue the frame to a new total of samples, without another burn-in.
 
         Raises:
-            StartError: The frame cannot be continued, or a value does not fit; nothing has changed.
+            StartError: The frame cannot be continued, or a value is out of range. The machine is then unchanged.
         """
         if self.reason not in {BM2StopReason.SAMPLES, BM2StopReason.FULL}:
             raise StartError(

@@ -127,14 +127,15 @@ class UsedRegisters:
 
     Attributes:
         lines: Number of the model's lines on the board.
-        part: Index of the board, and number of boards, if the parameters contain them; otherwise None.
+        part: Index of the board and number of boards, or None if the parameters do not contain them.
         replicas: Number of machines on the board.
         inputs: Name of the block of inputs.
         input_words: Number of input words of all replicas.
         result_words: Number of words of the block RESULTS, for all replicas.
-        written: Number of words of each other block that a host may write, by name.
-        answer: Number of words of each block that a stopped board sends, by name, in this order; RESULTS is the first.
-        capabilities: Values of the capability registers (`CAP_LINES`) or their fields (`CAP_MACHINE.KIND`), by name.
+        written: For the name of each other block that a host may write, the number of words.
+        answer: For the name of each block that a stopped board sends, the number of words. The blocks are in the
+            order of sending, and RESULTS is the first.
+        capabilities: Values of capability registers (`CAP_LINES`) or of their fields (`CAP_MACHINE.KIND`), by name.
         size: The size of the machine, described for a user.
     """
 
@@ -207,10 +208,10 @@ class FrameCourse(ABC):
     """A frame on all boards, from its start through its slices.
 
     Attributes:
-        starts: For each board the blocks to write before the start.
+        starts: The blocks to write before the start, for each board.
         settings: The settings of the present slice, for all boards.
-        begun: Cycle after which this slice begins.
-        end: Last cycle of this slice; 0 if it ends with the frame.
+        begun: Last cycle before the present slice.
+        end: Last cycle of the present slice, or 0 if the slice ends with the frame.
     """
 
     starts: Sequence[Blocks]

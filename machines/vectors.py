@@ -64,9 +64,10 @@ _define(operator.rshift, "lshr", 2)
 
 
 def in_llvm(result: Any, *kinds: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return a decorator for a function that writes LLVM code: it becomes a function that compiled code can call.
+    """Return a decorator for functions that write LLVM code. Compiled code can call the decorated functions.
 
-    `kinds` are the types of its arguments; None for any array, whose data's address is passed to the LLVM code.
+    `result` is the type of the result, and `kinds` are the types of the arguments. None stands for any array: the
+    LLVM code gets the address of the array's data.
     """
 
     def decorate(write: Callable[..., Any]) -> Any:

@@ -26,10 +26,10 @@ class Endpoint:
     """A board's address: a unix socket's path, or a TCP host and port.
 
     Attributes:
-        path: Path of the unix socket; empty for TCP.
-        host: Name or address of the TCP host; empty for a unix socket.
-        port: TCP port; 0 for a unix socket.
-        key: Key of a link over TCP, empty for none; a unix socket is private and needs none.
+        path: Path of the unix socket, or empty for TCP.
+        host: Name or address of the TCP host, or empty for a unix socket.
+        port: TCP port, or 0 for a unix socket.
+        key: Key of a link over TCP, or empty for none. A unix socket is private and needs no key.
     """
 
     path: str = ""

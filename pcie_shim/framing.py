@@ -61,12 +61,12 @@ class Frame(NamedTuple):
     """One frame as received.
 
     Attributes:
-        operation: One of this module's operations.
-        flags: Sum of this module's flags.
-        sequence: Number of the request, from 1, modulo 2^32; an answer has the number of its request.
+        operation: One of the operations of this module.
+        flags: Sum of flags of this module.
+        sequence: Number of the request, from 1, modulo 2^32. An answer has the number of its request.
         address: Offset in the register map, in bytes.
-        words: Number of words in the payload, or requested words in a READ request.
-        payload: The words as bytes in the buffer of the decoder, valid until the next bytes are received.
+        words: Number of words in the payload, or number of requested words in a READ request.
+        payload: The words as bytes in the decoder's buffer. They are valid until the decoder receives more bytes.
     """
 
     operation: int

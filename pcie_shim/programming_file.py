@@ -63,14 +63,14 @@ class Image:
 
     Attributes:
         machine: The board's machine, of any kind, with the board's lines.
-        partition: Position of these lines in the model.
+        partition: Position of the board's lines in the model.
         interface_sensors: Number of input words that the board implements (thesis 3.2: 20).
         interface_results: Number of result words that the board implements (thesis 3.2: 1200).
-        model_hash: SHA-256 (hex) of the model; the same for all boards of a deployment.
+        model_hash: SHA-256 (hex) of the model. All boards of a deployment have an identical hash.
         build_date: Date of the build, ISO 8601.
 
     Raises:
-        ImageError: The machine is larger than the interface, the interface is larger than the register map, or the
+        ImageError: The machine does not fit the interface, the interface does not fit the register map, or the
             partition does not match the lines.
     """
 

@@ -22,7 +22,7 @@ from bridge.names import absolute, ros2_type
 _ROSAPI_TIMEOUT: Final = 1.0
 _ROSAPI: Final = "/rosapi/"
 _MAX_SERVICES: Final = 1000
-"""Maximum number of services whose types are remembered; each call of a further one asks for the type again."""
+"""Maximum number of services for which a client remembers the type. For other services, each call asks for the type."""
 
 _log = logging.getLogger("bridge")
 

@@ -1,14 +1,15 @@
-"""The rosbridge server without sockets, which turns messages from clients into messages for clients.
+"""The rosbridge server without sockets. It turns the messages of clients into messages for clients.
 
 The owner of sockets and clocks calls `Broker.connect`, `Broker.receive_turn`, `Broker.wake` and
-`Broker.disconnect`, then drains the outboxes of the clients that `Broker.take_ready` returns. The broker
-never waits, never reads the monotonic clock, and never raises because of data from a client.
+`Broker.disconnect`. After each call, the owner drains the outboxes of the clients that `Broker.take_ready`
+returns. The broker never waits, never reads the monotonic clock, and never raises because of data from a client.
 
-Invalid operations are refused as on the reference server (rosbridge_suite): with a line in the log and on
-`/rosout`, but without an answer unless the client requested status messages (`set_level`). Only calls and goals
-are answered, with `result: false` and a sentence in `values`. The client stays connected.
+The broker refuses invalid operations as the reference server (rosbridge_suite) does. It writes a line to the log
+and to `/rosout`, and the client stays connected. Only refused calls and goals are answered, with `result: false`
+and a sentence in `values`. For other refused operations, the client gets a status message if it has requested
+status messages (`set_level`).
 
-Messages are not checked against their types, but all JSON sent is strict, with `null` for every NaN and
+The broker does not check messages against their types. All JSON sent is strict: `null` replaces every NaN and
 infinity received.
 """
 

@@ -82,7 +82,11 @@ class Caller:
         )
 
     def operation(self, op: str, kind: str, **fields: object) -> bytes:
-        """Return an operation for this client; its key `kind` (service or action) has the name that the client used."""
+        """Return an operation for this client, as JSON.
+
+        `kind` is `service` or `action`. Under this key, the operation has the name that the client used for the service
+        or action.
+        """
         identity = {} if self.id is None else {"id": self.id}
         return orjson.dumps({"op": op, kind: self.name, **fields, **identity})
 
@@ -396,7 +400,10 @@ class Actions(_Exchange):
         self._dispatcher.send(server, payload)
 
     def cancel(self, client: Client, operation: Operation, _now: float) -> None:
-        """Perform `cancel_action_goal`: pass it on to the server; the goal ends when the server sends its result."""
+        """Perform `cancel_action_goal`: pass the cancellation on to the client that serves the action.
+
+        The goal ends when the serving client sends the result of the goal.
+        """
         name = text(operation, "action")
         goal_id = operation.get("id")
         key = client.goals.get(goal_id) if isinstance(goal_id, str | int | None) else None

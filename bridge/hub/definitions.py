@@ -57,7 +57,7 @@ class MessageDefinitions:
         self._defaults: dict[str, dict[str, Any]] = {}
 
     def load(self) -> None:
-        """Import rosbags and its types, unless they are loaded already; this takes a tenth of a second."""
+        """Import rosbags and its message types. The first call takes a tenth of a second; later calls do nothing."""
         if not self._is_loaded:
             self._is_loaded = True
             with contextlib.suppress(ImportError):

@@ -113,7 +113,7 @@ class Filler:
         return grown
 
     def _look_up(self, message: dict[str, Any]) -> _Absent:
-        """Return what a message lacks, and remember it for messages with the same fields."""
+        """Return the absent fields of a message, and cache the result for messages with identical field names."""
         varying, defaults = self._varying, self._defaults
         absent = {
             field: varying[field](message) if field in varying else default

@@ -1,4 +1,7 @@
-"""Topics: advertising, publishing, subscribing, latching; subscribers to the same encoding share an encoded message."""
+"""Topics: advertising, publishing, subscribing and latching.
+
+The subscribers to one encoding share an encoded message.
+"""
 
 import time
 from collections.abc import Callable, Sequence
@@ -114,10 +117,11 @@ class Topics:
             self.distribute(topic, parsed, now)
 
     def publish_known(self, client: Client, messages: Sequence[bytes], first: int, now: float) -> int:
-        """Perform `publish` operations whose envelopes (the bytes before the message) are known, parsing only the rest.
+        """Perform `publish` operations that begin with a known envelope, and parse only the bytes after the envelope.
 
-        `messages` may contain any operations. Returns the index, from `first` on, of the first one that was not
-        performed, because it must be parsed in full or the client's turn was over; `len(messages)` if there is none.
+        `messages` may contain any operations, and `first` is the index of the first operation to perform. Return the
+        index of the first operation that was not performed, or `len(messages)` if all were performed. An operation is
+        not performed if it must be parsed in full, or if the client's turn is over.
         """
         advertisement = client.last_published
         while advertisement is not None and first < len(messages) and self._dispatcher.work <= TURN_WORK:

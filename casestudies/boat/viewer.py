@@ -43,8 +43,8 @@ Numbers = dict[str, Any]
 def numbers_of(instance: "Instance") -> Numbers:
     """Return a frame as a JSON object, or raise an OutputError if its posterior is not over a map.
 
-    `true_cell` and `mean` are indices of cells, from the lower left corner, as in the objects of `listen --json`;
-    `true_position` and `mean_value` are the positions in map units. `distance_cells` is the distance from the
+    `true_cell` and `mean` are indices of cells, counted from the lower left corner as in `listen --json`.
+    `true_position` and `mean_value` are positions in map units. `distance_cells` is the distance from the
     posterior's mean to the centre of the true cell.
     """
     from casestudies.boat.pictures import posterior_grid

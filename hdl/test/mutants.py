@@ -233,11 +233,11 @@ def _checks(mutant: Mutant) -> list[Check]:
 
 
 def caught_by(mutant: Mutant) -> tuple[Check, str] | None:
-    """Return the first check that detects a mutant, and its failure, or None.
+    """Return the first check that detects a mutant, and why the check fails, or None if no check detects the mutant.
 
     Raises:
-        HardwareToolError: A tool refuses the mutant, which does not count as detection.
-        ValueError: The text that the mutant replaces does not occur in its file exactly once.
+        HardwareToolError: A tool refuses the mutant. A refusal does not count as a detection.
+        ValueError: The mutant's file does not contain the text to replace exactly once.
     """
     with tempfile.TemporaryDirectory(prefix="mutant-rosbayes-") as where:
         hdl = Path(where) / "hdl"

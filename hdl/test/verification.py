@@ -36,11 +36,11 @@ class Check:
         return f"{self.kind}: {self.what.rpartition('.')[2]}"
 
     def failure(self, hdl: Path = HDL, frames: int | None = None) -> str | None:
-        """Run the check, and return why it fails, or None.
+        """Run the check, and return why the check fails, or None if it succeeds.
 
         Args:
-            hdl: Folder of the VHDL: `HDL`, or a changed copy (a mutant).
-            frames: Number of frames in a session; None for the usual number.
+            hdl: Folder of the VHDL, either `HDL` or a changed copy (a mutant).
+            frames: Number of frames in a session, or None for the usual number.
 
         Raises:
             HardwareToolError: A tool is missing or refuses the hardware.

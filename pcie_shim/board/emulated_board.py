@@ -180,9 +180,10 @@ class EmulatedBoard:
             self._allow(rm.BLOCKS[name], count, _READ_WRITE)
 
     def _measured_speed(self, image: Image, machine: BoardMachine) -> float:
-        """Measure the cycles per second of the frame that takes longest to emulate; its inputs remain in the registers.
+        """Measure the cycles per second of the frame that takes longest to emulate.
 
-        This measures the thread's CPU time, so that other load at this moment does not make the board appear slow.
+        The measured time is the CPU time of the thread. Other load on the computer therefore does not make the board
+        appear slow. The inputs of the frame remain in the registers.
         """
         host = image.kind.on_host([image.machine])
         course = host.begin(host.slowest())

@@ -272,11 +272,12 @@ class DrivenBoard:
             self.open_link.ask([*self._answer_blocks, (rm.DONE, DONE_BLOCK.size // 4)])
 
     def fetch(self) -> None:
-        """Store the answer of a board that is done, which the interrupt carried or `ask` has requested.
+        """Store the answer of a board that is done. The interrupt carried the answer, or `ask` has requested it.
 
-        This host holds the board, so nobody else starts it; but a reset, or a power cycle, between the interrupt and
-        the reads would clear the results. `ask` therefore reads the registers from DONE to COMPUTE_NS last: if they
-        still equal the interrupt's values, the machine has not run since, and the blocks contain this frame's results.
+        This host holds the board, so no other host starts the machine. But if the board is reset or switched off
+        between the interrupt and the reads, the results are cleared. `ask` therefore reads the registers from DONE to
+        COMPUTE_NS last. If number, status and cycles still equal the interrupt's values, the blocks contain this
+        frame's results. Otherwise, a SequenceError is raised.
         """
         done = self._answered()
         words = done.results

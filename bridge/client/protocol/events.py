@@ -27,7 +27,8 @@ class Message(NamedTuple):
         """The serialised bytes of a message of a `cbor-raw` subscription.
 
         Raises:
-            DecodeError: The message has no such bytes: the subscription or the server does not use cbor-raw.
+            DecodeError: The message has no serialised bytes, because the subscription or the server does not use
+                `cbor-raw`.
         """
         data = self.msg.get("bytes")
         if type(data) is not bytes:
