@@ -44,22 +44,22 @@ Result = TypeVar("Result")
 class Posteriors:
     """A subscription to the posteriors of a stack on the client's server, read by one task with `async for`.
 
-    A lost connection does not end the iteration: it continues after the reconnection. Closing this object (`async
-    with`, before the client is closed) or the client ends it. If the reader is too slow, the oldest posteriors are
-    dropped; the connection is not affected.
+    After a lost connection, the iteration continues as soon as the client has reconnected. The iteration ends if this
+    object or the client is closed. Use `async with`, so that this object is closed before the client. If the reader is
+    too slow, the oldest posteriors are dropped. The connection is not affected.
 
     Args:
         ros: The open client.
-        topic: Topic of the posteriors (the one given to `toolchain build --output`).
+        topic: Topic of the posteriors, as given to `toolchain build --output`.
         frame_topic: Topic of the frame reports.
-        deployment: The model's name, to ignore frames of other stacks on the same server.
-        queue_size: Maximum number of posteriors that wait for their reader; then the oldest is dropped and
+        deployment: The model's name. If it is given, frames of other models are ignored.
+        queue_size: Maximum number of posteriors that wait for the reader. If more arrive, the oldest is dropped and
             counted.
         compression: `cbor` transfers large posteriors faster if the server supports it.
 
     Raises:
         NameFormError: A topic's name is malformed.
-        TypeConflictError: This client already subscribes to one of the topics, with another type.
+        TypeConflictError: This client already subscribes to the topic with another type.
         OptionError: `queue_size` is less than 1.
         DisconnectedError: The client is closed.
 

@@ -16,7 +16,11 @@ class Part(BaseModel):
 
 
 def validated(adapter: TypeAdapter[Model], value: object, topic: str, type_name: str) -> Model:
-    """Return a message, or a part of it, as its model; a BadResultError names the topic, the type and a mistake."""
+    """Return a message, or a part of a message, as its model.
+
+    Raises:
+        BadResultError: The value does not fit the model. The error names the topic, the type, and the first mistake.
+    """
     try:
         return adapter.validate_python(value)
     except ValidationError as error:

@@ -150,7 +150,10 @@ class Posterior:
 
     @property
     def rosbridge_out_us(self) -> float | None:
-        """Microseconds from the sending of the posterior to its arrival here; None as for `latency_us`."""
+        """Microseconds from the sending of the posterior to its arrival here.
+
+        None if unknown, or if the clocks of the two computers differ too much.
+        """
         return self._since(self.report.sent_ns if self.report else None)
 
     def _since(self, begin_ns: int | None) -> float | None:
@@ -192,7 +195,7 @@ class Posterior:
         return {axis.label: axis.value(best[axis.label]) for axis in self._known_axes()}
 
     def mean_value(self) -> dict[str, float | str]:
-        """Return the mean in its unit, for each label whose states have no names.
+        """Return the mean of each label in the label's unit. Labels with named states are left out.
 
         Raises:
             LabelError: The deployment is not known.

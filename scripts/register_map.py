@@ -1,13 +1,13 @@
 """Generator of the register map's constants, page, VHDL and C header from the SystemRDL file (`scripts/registers`).
 
-It is needed only for development: its output is committed, so SystemRDL tools are not needed at run time. The hash
-of the map covers the definition (names, addresses, sizes, fields, access, resets, encodings), but not the
-explanations. PeakRDL writes the C header. The other files come from templates in register_templates/, because:
+The generator is needed only for development. Its output is committed, so no SystemRDL tool is needed at run time. The
+map's hash covers names, addresses, sizes, fields, access, resets and encodings, but not the explanations. PeakRDL
+writes the C header. The other files come from templates in register_templates/, for two reasons:
 
 - peakrdl-markdown repeats every element of an array, leaves out the values of encodings, and has no links.
-- peakrdl-regblock-vhdl buffers the low word of a 64-bit register until the high one is written, but a board accepts
-  single words. It also needs a second decoder for accesses that are refused depending on address, state and value, and
-  a VHDL package from its wheel.
+- peakrdl-regblock-vhdl buffers the low word of a 64-bit register until the high word is written. A board, however,
+  accepts single words. peakrdl-regblock-vhdl also needs a VHDL package from its wheel. Some accesses are refused
+  depending on address, state and value; for these accesses, a second decoder would be necessary.
 """
 
 import hashlib

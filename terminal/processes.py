@@ -222,7 +222,7 @@ class Process:
         """Wait for a line that matches `pattern`.
 
         Raises:
-            ProcessError: The process ended before it printed such a line.
+            ProcessError: The process ended before it printed a matching line.
         """
         seen = 0
         while True:

@@ -76,8 +76,8 @@ class LockedRunDirectory:
         """Lock the directory.
 
         Raises:
-            OccupiedError: Another run uses it.
-            OutputError: It is not a folder and cannot be created, or other users can enter it.
+            OccupiedError: Another run uses the directory.
+            OutputError: The path is not a folder and cannot be created, or other users can enter the folder.
         """
         self.path = run_directory(given)
         """The absolute path of the directory."""

@@ -127,9 +127,10 @@ class Measured:
     async def stages(self, ros: Ros, some: list[dict[str, int]]) -> None:
         """Measure the stages of some frames.
 
-        The stages on the wire are measured with this client's clock, which the host shares: from the reading's stamp to
-        its receipt by the subscriber, and from the start of the publication to the result's arrival here. Stages
-        are measured apart from cycle times, because a subscription to /bm/frame costs the hub and the client time.
+        The two stages on the wire are measured with the clock of this computer, on which the whole stack runs.
+        `wire_in` lasts from the reading's stamp to the receipt by the subscriber. `wire_out` lasts from the start of
+        the publication to the result's arrival here, less `rosbridge_out`. Stages and cycle times are measured in
+        separate runs, because a subscription to /bm/frame costs the hub and the client time.
         """
         frames = ros.subscribe("/bm/frame", "diagnostic_msgs/DiagnosticArray")
         await ros.call("/rosapi/get_time")  # so that the hub knows the subscription

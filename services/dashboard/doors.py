@@ -36,12 +36,12 @@ _HEADERS: Final = [
 
 
 class Doors:
-    """An ASGI application that admits requests to another one.
+    """An ASGI application that admits requests to another ASGI application.
 
     Args:
-        app: The application behind the doors.
+        app: The application that gets the admitted requests.
         policy: The accepted tokens, and the other web pages that may connect.
-        loopback: Whether the server listens on loopback, so that only this machine can reach it.
+        loopback: Whether the server listens on loopback. Only this machine can then reach the server.
     """
 
     def __init__(self, app: ASGIApp, policy: AccessPolicy, *, loopback: bool) -> None:

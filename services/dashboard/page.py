@@ -117,7 +117,7 @@ class Dashboard:
         live = Live(client.id)
 
         def offer() -> None:
-            """Offer the marginals of the newest posterior; the list is updated only if it differs."""
+            """Offer the marginals of the newest posterior. The list is updated only if the marginals have changed."""
             frame = self._feed.newest
             labels = frame.searched if frame is not None else ()
             # the horizontal variable is named first, as in a position

@@ -53,18 +53,18 @@ _QUEUE_SIZE: Final = 64
 
 
 class WatchedRobot:
-    """Everything that the page receives, and the calls it makes, over rosbridge and status sockets.
+    """The data that the page receives over rosbridge and status sockets, and the calls that the page makes.
 
     Attributes:
         state: State of the connection in words.
         connected: Whether there is a connection.
         landmarks: x, y and name of each landmark.
-        switches: By service name, the value last set here of each switch of the simulated world; at first True.
+        switches: Switches of the simulated world by service name, with the value last set here, at first True.
         can_set_pose: Whether the topic that moves the simulated boat has a subscriber.
-        lost: Lost frames by reason, as the processes of the stack count them.
+        lost: Number of lost frames by reason, as counted by the processes of the stack.
         boards: Endpoint, state and image of each board.
         why: Sentences about processes that are not ready.
-        samples: The last sampled states that a BM2 streamed, a line each; empty if it streams none.
+        samples: The last sampled states that a BM2 streamed, one line each, or empty without a stream.
     """
 
     def __init__(

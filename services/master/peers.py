@@ -3,8 +3,8 @@
     _keep:  _connect ──▶ _watch ──connection lost──▶ _bring_back ──▶ _connect ...
     records of a connection:  Hello ──▶ Ready ──▶ (all ready: Begin) ──▶ readings, frames, results ──▶ FrameFlow
 
-Each peer has a task `_keep`, whose error ends the run. With `--fused` there are no connections to keep, and the
-tasks are the services themselves.
+Each peer has a task `_keep`. An error of this task ends the run. With `--fused`, the services run as tasks of the
+master, and there are no connections to keep.
 """
 
 from __future__ import annotations

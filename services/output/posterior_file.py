@@ -49,7 +49,10 @@ class ResultFile(ABC):
 
 
 def open_result_file(path: Path) -> ResultFile:
-    """Open a file (`.jsonl` and `.csv` are appended to, `.npz` is overwritten), or raise a SettingsError."""
+    """Open a result file, or raise a SettingsError if the ending of the name is unknown.
+
+    The ending selects the format. An existing `.jsonl` or `.csv` file is appended to; a `.npz` file is overwritten.
+    """
     kinds: dict[str, Callable[[Path], ResultFile]] = {
         ".jsonl": _JsonLines,
         ".csv": _CsvLines,

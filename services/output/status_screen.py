@@ -193,10 +193,13 @@ def _counts(frames: FrameCounts | None) -> tuple[str, str, str, str, str]:
 
 
 async def show(directory: Path, *, needs_master: bool, watch: bool, json: bool) -> int:
-    """Print the status of a run, once or (with `watch`) every second; return 0 if everything is ready, otherwise 6.
+    """Print the status of a run once, or every second with `watch`.
+
+    Return 0 if everything is ready, otherwise 6.
 
     Raises:
-        SettingsError: Without `watch`, no process answers, or with `needs_master` the master does not.
+        SettingsError: No process answers, or no master answers although `needs_master` is true. With `watch`, this
+            error is not raised.
     """
     # in a file or a pipe, lines are not wrapped to the width of a terminal, and nothing is overwritten
     terminal = sys.stdout.isatty()

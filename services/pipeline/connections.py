@@ -41,8 +41,8 @@ async def connect_all(
 ) -> dict[str, Ros]:
     """Connect to each server once, and return the connections by URI.
 
-    The URI in the settings replaces all others. Connections are added to `by_uri` as they are created, so that
-    the status names also a server that is not reached yet; `options` are those of `connect`.
+    A URI in the settings replaces all URIs in `uris`. Each connection is added to `by_uri` before the server is
+    reached, so that the status also names an unreachable server. `options` are further options of `connect`.
 
     Raises:
         BridgeError: A server is unreachable, is not a rosbridge server, or is a `robot:NAME` that nobody announces.

@@ -1,10 +1,10 @@
-"""The synchroniser, which pairs messages of several topics by their stamps.
+"""The synchroniser. It pairs messages of several topics by their stamps.
 
-It does not read a clock: every call passes the time. Messages of one topic must be added in the order in
-which they were sent; between topics, any order gives the same sets if delays differ by less than the
-tolerance.
+The synchroniser does not read a clock: the caller passes the time with every call. Add the messages of one topic in
+the order in which they were sent. The order between topics is free: the sets do not depend on it if delays differ
+by less than the tolerance.
 
-The period of a topic is the median of its last intervals. A topic is *alive* until it is silent for
+The period of a topic is the median of the topic's last intervals. A topic is *alive* until it is silent for
 `ALIVE_PERIODS` of its periods.
 """
 

@@ -1,13 +1,16 @@
-"""A model of the reference server, for scripts/bench bridge: Tornado, threads, message classes.
+"""A model of the reference server rosbridge_suite, for scripts/bench bridge: Tornado, threads, message classes.
 
-It is not rosbridge_suite, which needs ROS, but does the same work for a message of one type: Tornado reads
-it. A queue passes it to the connection's thread, which parses it, checks every field against its type, and
-fills a message object. The message is serialised and sent through a socket, as between ROS nodes. The
-subscription's thread reads it, creates a message object, and writes the values as JSON. The text is passed to
-Tornado's loop, because only the loop may use the connections. All other work of rosbridge_suite is omitted,
-which makes this server faster.
+rosbridge_suite needs ROS, but this model does not. The model does the work of rosbridge_suite for one message type:
 
-It prints its URI. It runs in an environment with Tornado, so it does not import this project.
+- Tornado reads the message. A queue passes the message to the connection's thread.
+- The connection's thread parses the message, checks every field against its type, and fills a message object.
+- The message object is serialised and sent through a socket, as between ROS nodes.
+- The subscription's thread reads the bytes, creates a message object, and writes the values as JSON.
+- The JSON text is passed to Tornado's loop, because only the loop may use the connections.
+
+The model omits all other work of rosbridge_suite, so it is faster than rosbridge_suite.
+
+The program prints the URI of the server. It runs in an environment with Tornado, so it does not import this project.
 """
 
 from __future__ import annotations
