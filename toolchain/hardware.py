@@ -178,9 +178,9 @@ class Simulator(StrEnum):
     """A simulator of the hardware."""
 
     GHDL = "ghdl"
-    """GHDL: interprets the VHDL; compiled within seconds."""
+    """GHDL interprets the VHDL. It compiles a simulation within seconds."""
     VERILATOR = "verilator"
-    """Verilator, after a translation to Verilog by GHDL: a hundred times as fast as GHDL, compiled within minutes."""
+    """Verilator runs a translation to Verilog. It is a hundred times as fast as GHDL, and compiles within minutes."""
 
     @property
     def tools(self) -> tuple[str, ...]:

@@ -130,13 +130,13 @@ class Accuracy:
     Attributes:
         posteriors: Number of posteriors: one per frame, or one per replica of a frame.
         banks: Number of seed sets with which each reading was run.
-        impossible: Share of posteriors whose readings let no line count.
-        without: Share of runs without a posterior, including those whose counts remained 0.
+        impossible: Share of posteriors with readings that are impossible on every line, so that no counter counts.
+        without: Share of runs without a posterior, including runs in which all counts remained 0.
         overflow: Share of runs that ended with an overflow.
-        machine: The machine against the model; None without a model.
-        quantising: Exact inference on the codes against the model; None without a model.
-        sampling: The machine against exact inference on its codes.
-        z: Counts compared with equation 2.1; None if no line's expected count is high enough.
+        machine: Difference of the machine from the model, or None without a model.
+        quantising: Difference of exact inference on the codes from the model, or None without a model.
+        sampling: Difference of the machine from exact inference on the machine's codes.
+        z: Counts compared with equation 2.1, or None if no line's expected count is high enough.
     """
 
     frames: int

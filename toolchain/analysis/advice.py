@@ -41,7 +41,10 @@ _WIDTHS: Final = (8, 12, 16)
 
 
 _Run: TypeAlias = tuple[int, tuple[int, float, float], int, Estimate]
-"""Bits of a code; setting, total variation and cycles as in `Candidate`; number of boards; resources of one board."""
+"""The bits of a code, the results of a run, the number of boards, and the resources of one board.
+
+The results are `setting`, `total_variation` and `cycles` of `Candidate`.
+"""
 
 
 @dataclass(frozen=True, slots=True)

@@ -211,7 +211,9 @@ class Contents:
 
 
 def contents(joint: JointDistribution, searched: Sequence[str] = (), known: Sequence[str] = ()) -> Contents:
-    """Return the variables of a network. Those in `known` may be known; if it is empty, all that are not searched.
+    """Return the variables of a network, and which of the candidates in `known` depend on each other.
+
+    If `known` is empty, all variables that are not searched are candidates.
 
     Raises:
         ToolchainError: A variable does not exist or is named twice, or there are too many candidates.

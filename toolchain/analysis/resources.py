@@ -1,8 +1,8 @@
-"""Resources and energy of a BM1 on the FPGAs of its boards, and the number of boards that it needs.
+"""Resources and energy of a BM1 on the FPGAs of its boards, and the number of boards that the BM1 needs.
 
-Tables are memories, so that their content can be changed without a new compilation. Nothing here was measured on a
-board. Logic is estimated; energy is estimated from toggles of nets, with the same energy for each net;
-`ASSUMPTIONS` lists the constants.
+Tables are memories, so new tables need no new compilation. Nothing here was measured on a board. Logic is estimated.
+Energy is estimated from toggles of nets, and each toggle of any net costs the same energy. `ASSUMPTIONS` lists the
+constants.
 """
 
 import math
@@ -86,9 +86,9 @@ def estimate(
 def _why_not(
     machine: BM1Parameters, device: Device, table_length: int, interface: tuple[int, int] | None
 ) -> str:
-    """Return what the device or the interface of a board lacks for a machine, as a clause; empty if the machine fits.
+    """Return as a clause why a machine does not fit the device or the interface of a board, or "" if it fits.
 
-    `interface` is the value of `--interface` (inputs, results); None allows as many as the register map has room for.
+    `interface` is the value of `--interface` (inputs, results). None means the most that the register map has room for.
     """
     used = BM1.registers(machine)
     whose = "the map" if interface is None else "the interface"

@@ -87,12 +87,12 @@ def build_deployment(
 ) -> Built:
     """Write a deployment: `deployment.toml`, an image per board, a report, and the hardware project.
 
-    The same plan gives the same bytes. A deployment in the folder is replaced. `remarks` returns sentences to
-    add to the report.
+    The bytes depend only on the plan. The build replaces a deployment that is in the folder already. `remarks`
+    returns sentences to add to the report.
 
     Raises:
-        BuildError: The options contradict the register map, or the folder cannot be written, or it has no deployment,
-            but files that the build would overwrite or remove.
+        BuildError: The options contradict the register map, or the folder cannot be written. A folder without a
+            deployment is also refused if the build would overwrite or remove files in it.
     """
     built = assemble(plan)
     for remark in remarks(built):

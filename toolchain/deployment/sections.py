@@ -432,7 +432,7 @@ class BoardSection(Section):
 
 
 class Output(Section):
-    """`[[output]]`: a topic of posteriors; an empty URI means the URI of the first source."""
+    """`[[output]]`: a topic of posteriors. If the URI is empty, the URI of the first source is used."""
 
     topic: Topic = "/BMresults"
     type: Literal["std_msgs/Float64MultiArray"] = "std_msgs/Float64MultiArray"

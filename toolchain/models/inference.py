@@ -1,9 +1,11 @@
 """Exact inference on a product of factors: tests of independence, and sums over the symbols that a question omits.
 
-Independence is tested on the moral graph without the searched symbols and those with a fixed value. The other symbols
-are eliminated one by one, exactly, in float64. The order is planned before anything is computed, by two rules:
-eliminate next the symbol that needs the smallest table, or the one that joins the fewest pairs of symbols (min-fill).
-The order with the smaller tables is used; if both orders need a table above the limit, the question is refused.
+Independence is tested on the moral graph, from which the searched and the fixed symbols are removed. Omitted symbols
+are eliminated one by one, exactly, in float64.
+
+The order of elimination is planned in advance by two rules. By the first rule, the next symbol is the one that needs
+the smallest table (min-weight). By the second rule, it is the one that joins the fewest pairs of symbols (min-fill).
+The order with the smaller tables is used. If both orders need a table above the limit, the question is refused.
 """
 
 import math
@@ -66,9 +68,9 @@ def product(terms: Sequence[Term], scope: Sequence[str], sizes: Mapping[str, int
 
 
 def eliminate(terms: Iterable[Term], names: Iterable[str], sizes: Mapping[str, int]) -> list[Term]:
-    """Sum the product of terms over the symbols in `names`; return terms whose product is proportional to it.
+    """Sum the product of terms over the symbols in `names`; return terms with a product proportional to the sum.
 
-    Tables are scaled by their maxima, so that long products don't underflow: the result is exact up to a
+    Each table is scaled by its maximum, so long products do not underflow. The result is therefore exact up to a
     constant factor. If every order needs an intermediate table above the limit, a ModelError is raised.
     """
     left = dict(enumerate(terms))
@@ -104,7 +106,10 @@ class _Plan:
 
 
 def _order(terms: Iterable[Term], names: set[str], sizes: Mapping[str, int]) -> tuple[str, ...]:
-    """Return the order in which to sum out `names`: the cheaper of min-weight and min-fill; or raise a ModelError."""
+    """Return the cheaper of the min-weight and the min-fill order in which to sum out `names`.
+
+    Raises a ModelError if the largest table of this order is above the limit.
+    """
     graph: _Graph = {name: set() for name in names}
     for term in terms:
         for name in term.scope:

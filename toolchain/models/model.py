@@ -47,7 +47,7 @@ _SUM_TOLERANCE: Final = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Normal:
-    """The normal distributions from which a table is computed; `toolchain fit` replaces what it can learn."""
+    """The normal distributions from which a table is computed. `toolchain fit` can learn some of the parameters."""
 
     mean: NDArray[np.float64]
     """float64[lines], in the reading's unit."""

@@ -85,11 +85,11 @@ def network_model(
     known: Sequence[Symbol],
     given: Mapping[str, int],
 ) -> NetworkModel:
-    """Return the network of a question; `symbols` are those of its joint distribution, in the machine's order.
+    """Return the network of a question; `symbols` are the joint distribution's symbols, in the machine's order.
 
     Raises:
-        ModelError: A factor has a number that is negative, infinite or NaN, or is 0 everywhere once the given values
-            are fixed.
+        ModelError: A factor has a number that is negative, infinite or NaN. A factor that is 0 everywhere once the
+            given values are fixed is also an error.
     """
     for factor in factors:
         if not np.all(np.isfinite(factor.table)) or np.any(factor.table < 0):

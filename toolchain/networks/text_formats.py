@@ -372,12 +372,13 @@ _UAI_COMMENTS: Final = r"#[^\n]*|(?m:^c\b[^\n]*)"
 
 
 def read_uai(data: bytes, builder: NetworkBuilder) -> None:
-    """Read a UAI file: a preamble (kind, sizes, variables of each factor), then the numbers of each factor.
+    """Read a UAI file. A preamble (kind, sizes, variables of each factor) is followed by the numbers of each factor.
 
-    The last variable of a factor varies fastest; in a BAYES file it is the child. (pyagrum 3.3.1 writes the first
-    parent fastest, contrary to the format.) pgmpy 0.1 to 1.1 lists the variables in the same order, but writes the
-    numbers in the reverse one: the first variable varies fastest, the child slowest. A file is read in pgmpy's order if
-    one of its tables sums to 1 only in that order.
+    By the format, a factor's last variable varies fastest. In a BAYES file, this variable is the child.
+
+    Two programs deviate from the format. pyagrum 3.3.1 writes the first parent fastest. pgmpy 0.1 to 1.1 lists the
+    variables in the format's order, but writes the numbers so that the first variable varies fastest and the child
+    slowest. A file is read in pgmpy's order if a table sums to 1 only in that order.
     """
     text = Scanner(data, builder.path, comments=_UAI_COMMENTS)
     kind = text.word("BAYES or MARKOV")
