@@ -178,7 +178,7 @@ def addressed_codes(machine: BM1Machine, start: Start) -> npt.NDArray[np.uint16]
     """Return the codes selected by the inputs of a valid start.
 
     Returns:
-        uint16[columns, lines], with the prior in row 0; with replicas uint16[replicas, columns, lines].
+        uint16[columns, lines], or uint16[replicas, columns, lines] for several replicas. Column 0 is the prior.
     """
     parameters = machine.parameters
     codes = np.empty((parameters.replicas, parameters.columns, parameters.lines), dtype=np.uint16)

@@ -374,11 +374,11 @@ class BM2Start:
     Attributes:
         state: The packed start state, with the evidence.
         known: Mask of the state bits of the known variables.
-        samples: Number of samples after which the machine stops, 1 to 2**32 - 1; 0 if no state fits the evidence.
-        burn_in: Whole sweeps before the first sample.
+        samples: Number of samples after which the machine stops, 1 to 2**32 - 1. It is 0 if no state fits the evidence.
+        burn_in: Number of whole sweeps before the first sample.
         ops_timeout: Maximum number of cycles of a move.
-        max_cycles: The frame's last cycle.
-        bank: Set of seeds from which the generators restart (`rng_reset` = `bank`); free generators ignore it.
+        max_cycles: Maximum number of cycles of the frame.
+        bank: Set of seeds from which the generators restart. If `rng_reset` is `free`, the bank has no effect.
         sequencer: Order in which the sequencer points at bits.
     """
 

@@ -42,7 +42,7 @@ IN_STEP: Final = PARTS * LANES
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ChainResult:
-    """The results and the state of a chain after its stop; the attributes are those of `BM2Kernel`."""
+    """The results and the state of a chain after its stop. See `BM2Kernel` for the attributes."""
 
     reason: BM2StopReason
     cycles: int
@@ -88,10 +88,12 @@ class Chains:
         self._kernels: list[BM2Kernel] = []
 
     def run(self, starts: Sequence[BM2Start]) -> tuple[ChainResult, ...]:
-        """Run a frame of every chain to its stop; this is fast if the starts differ only in `state` and `bank`.
+        """Run a frame of every chain to its stop.
+
+        The chains run together, which is faster, only if their starts differ in nothing but `state` and `bank`.
 
         Raises:
-            StartError: The numbers of starts and chains differ, or a start does not fit; no chain has run.
+            StartError: The numbers of starts and chains differ, or a start does not fit. No chain has run then.
         """
         if len(starts) != len(self._machines):
             raise StartError(f"There are {len(starts)} starts for {len(self._machines)} chains.")

@@ -43,7 +43,10 @@ class Generators(NamedTuple):
 
 
 class _Store(NamedTuple):
-    """Cached words, by slot (a block of cycles of a bank; the last slot is scratch) and by row (a code of a column)."""
+    """Cached words: the bits that cells make, one bit per cycle.
+
+    A slot holds one block of cycles of a bank. The last slot is scratch memory. A row holds one code of one column.
+    """
 
     words: Words  # [slots, rows * BLOCK_WORDS]
     filled: npt.NDArray[np.uint8]  # [slots, rows]: whether these words are cached

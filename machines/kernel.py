@@ -70,10 +70,11 @@ class BM1Kernel(ABC):
     def start(self, start: Start) -> StopReason:
         """Run a new frame to its end, or to the end of its first slice.
 
-        Counters start at 0; generators restart from the start's bank (`rng_reset` = `bank`) or continue (`free`).
+        All counters start at 0. If `rng_reset` is `bank`, the generators restart from the bank of `start`. If
+        `rng_reset` is `free`, the generators continue.
 
         Raises:
-            StartError: The start does not fit the machine; nothing has changed.
+            StartError: The start does not fit the machine. The machine is then unchanged.
         """
         check_start(self.machine.parameters, start)
         self._target_count = int(start.target_count)

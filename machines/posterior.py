@@ -14,12 +14,18 @@ from machines.parameters import BM1Parameters, SensorMode
 def joint_posterior(
     counts: Sequence[npt.NDArray[np.uint32]], cycles: Sequence[int]
 ) -> npt.NDArray[np.float64] | None:
-    """Return the posterior over the lines of all boards, float64[all lines], normalised jointly (thesis equation 2.3).
+    """Return the posterior over the lines of all boards, normalised jointly (thesis equation 2.3).
 
-    The probability of a line is proportional to its count divided by the cycles of its board; a board without
-    cycles (none of its lines can count) has the weight 0. Counts must not be normalised for each board
-    separately, because each board stopped at its own cycle. `counts` are uint32[lines] of each board, in the
-    order of the model's lines. If every count is 0, the result is None.
+    The probability of a line is proportional to the line's count divided by the cycles of its board. Each board stops
+    at its own cycle, so counts must not be normalised for each board separately. If no line of a board can count, the
+    board has 0 cycles, and its lines get the probability 0.
+
+    Args:
+        counts: Counts of each board, uint32[lines of the board], in the order of the model's lines.
+        cycles: Number of cycles that each board ran.
+
+    Returns:
+        float64[all lines], or None if every count is 0.
 
     Raises:
         MachineError: The numbers of counts and of cycles differ, or a board has counts without cycles.

@@ -1,9 +1,9 @@
 """The random number generators of a machine: seeds, steps and outputs.
 
-BM1 has one generator for each column, or for each cell if they are not shared; BM2 has one for each CDE. Each
-generator has a serial number, from which its seed follows: its column or CDE, or line * columns + column for a cell,
-plus s times the count of generators for seed set s. The state of a generator is one uint64, and a cell or CDE compares
-its code with the low `prob_bits` bits of the output.
+A BM1 has one generator for each column, or one for each cell if generators are not shared. A BM2 has one for each CDE.
+The serial number of a generator determines its seed. In seed set 0, the serial number is the number of the column or
+CDE, or line * columns + column for a cell. Seed set s adds s times the number of generators. The state of a generator
+is one uint64. A cell or CDE compares its code with the low `prob_bits` bits of the generator's output.
 """
 
 import math

@@ -173,9 +173,9 @@ End = Callable[[GoalStatus, Mapping[str, Any] | str], None]
 
 
 class GoalRequest:
-    """A goal that this client executes, as the handler of the action gets it.
+    """A goal that this client executes. The handler of the action receives it.
 
-    The first of `succeed`, `abort` and `cancel` ends it; the handler may continue, to clean up.
+    The first call of `succeed`, `abort` or `cancel` ends the goal. The handler may then continue, to clean up.
 
     Attributes:
         values: Fields of the goal.

@@ -61,7 +61,7 @@ class Handle:
         self._session.flush()
 
     def end(self) -> None:
-        """End the handle without sending anything; called by `close`, and by the client when it is closed."""
+        """End the handle without sending anything. Both `close` and the closing of the client call this method."""
         self._closed = True
 
     def _withdraw(self) -> None:
@@ -387,7 +387,7 @@ class Service(Handle):
 
     Attributes:
         name: Name of the service.
-        check: Checks answers before they are sent, if their type is known.
+        check: Function that checks an answer before it is sent, or None if the service's type is unknown.
     """
 
     def __init__(

@@ -359,12 +359,13 @@ class Ros:
     async def detect_ros_version(self, timeout: float = DETECT_TIMEOUT) -> RosVersion | None:
         """Detect the ROS version of the server, if possible.
 
-        The sources are, in this order: the option of `connect`, the stamps of received messages, and rosapi
-        (the spelling of the type of `/rosout`, or the version). Later advertisements and subscriptions, and
-        those restored after a reconnection, use type names of the detected version.
+        The first source is the option of `connect`. The second source is the stamps of received messages. The last
+        source is rosapi, with the type name of `/rosout` or the answer of `get_ros_version`. Later advertisements
+        and subscriptions use type names of the detected version, also when a reconnection restores them.
 
         Returns:
-            1 or 2; None if there is neither rosapi nor a message with a header, or after `timeout` seconds.
+            1 or 2, or None if the version is still unknown after `timeout` seconds. The version stays unknown if
+            the server has no rosapi and no message with a header has arrived.
         """
         if self.ros_version is None:
             # The type of /rosout first: a ROS 1 server without `get_ros_version` logs an error when it is asked
@@ -392,7 +393,10 @@ class Ros:
         return await self._ask_names(timeout, "publishers", topic=topic)
 
     async def message_details(self, type: str, timeout: float = 1.0) -> Definitions:
-        """Return the fields of a message type and of the types nested in it, by ROS 1 type name; empty if unknown."""
+        """Return the fields of a message type and of all nested types, by ROS 1 type name.
+
+        The result is empty if the server has no rosapi or does not know the type.
+        """
         args = {"type": self._session.core.wire.type_name(type)}
         return definitions_from_rosapi(await self._session.ask_rosapi("message_details", args, timeout))
 

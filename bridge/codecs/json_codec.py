@@ -171,12 +171,12 @@ def _finite_or_none(text: str) -> float | None:
 
 
 def encode(message: Mapping[str, Any], *, max_size: int = MAX_SIZE, max_depth: int = MAX_DEPTH) -> bytes:
-    """Write one message, whose values may be NumPy arrays and scalars, as JSON without white space.
+    """Write one message as JSON without white space. Values may be NumPy arrays and scalars.
 
     Raises:
-        EncodeError: The message is too deep, or contains a type that JSON does not have, an integer beyond 64
-            bits, a key that is not a string, or a NaN or infinity (the error names the field).
-        MessageTooLargeError: The JSON is too large.
+        EncodeError: The message is nested too deep, or contains a type that JSON does not have. Other causes are
+            integers beyond 64 bits, keys that are not strings, NaN and infinity.
+        MessageTooLargeError: The JSON has more than `max_size` bytes.
     """
     try:
         try:

@@ -129,10 +129,10 @@ def read_tokens(path: Path) -> tuple[str, ...]:
 
 
 def tls_context(certificate: Path, key: Path) -> ssl.SSLContext:
-    """Return the context for TLS 1.2 or later from the hub's certificate and its key, which has no passphrase.
+    """Return the context for TLS 1.2 or later, from the certificate and the private key of the hub.
 
     Raises:
-        HubError: A file cannot be read, or the two do not belong together.
+        HubError: A file cannot be read, the key has a passphrase, or the key does not belong to the certificate.
     """
     # An error of `load_cert_chain` does not say which file cannot be read, so they are read first.
     context = ssl.create_default_context(ssl.Purpose.CLIENT_AUTH)

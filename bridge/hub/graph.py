@@ -144,7 +144,10 @@ class Offer:
 
 
 class Graph:
-    """The hub's ROS graph: clients by number; topics, services and actions by absolute name."""
+    """The ROS graph of the hub.
+
+    The key of a client is its number. The key of a topic, a service or an action is its absolute name.
+    """
 
     def __init__(self) -> None:
         self.clients: dict[int, Client] = {}

@@ -72,10 +72,10 @@ _STAGES: Final[tuple[_Stage, ...]] = (
 
 
 def stage_shares(instances: Iterable[Instance]) -> tuple[StageShare, ...]:
-    """Return the stages in order, except those that no frame with a posterior reports.
+    """Return the stages in order. Stages that no frame with a posterior reports are left out.
 
-    `rosbridge out` is measured here, from the sending of a result to its arrival; the other stages
-    come from `/bm/frame`.
+    This process measures `rosbridge out`, from the sending of a result to its arrival. `/bm/frame` reports all
+    other stages.
     """
     return _shares(instances, _STAGES)
 
@@ -143,10 +143,10 @@ _EDGE: Final = 0.2
 
 
 def far_apart(instances: Iterable[Instance]) -> tuple[Instance, ...]:
-    """Return at most `POSITIONS_SHOWN` results whose true positions are far from each other, in the order of time.
+    """Return at most `POSITIONS_SHOWN` results with true positions far from each other, in the order of time.
 
-    The first result is chosen, then repeatedly the one furthest from those chosen before. Results without a truth are
-    used only if there are no others.
+    The function chooses the first result. It then repeatedly adds the result whose nearest chosen result is furthest
+    away. Results without a true position count only if no result has one.
     """
     results = [instance for instance in instances if instance.posterior is not None]
     candidates = [instance for instance in results if instance.truth is not None] or results

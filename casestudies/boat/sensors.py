@@ -27,7 +27,7 @@ BEARING_NAMES: Final = ("B1", "B2", "B3")
 SENSOR_NAMES: Final = DISTANCE_NAMES + BEARING_NAMES
 """Names of the sensors, in the order of the machine's columns and of the readings in an array message."""
 LONGEST_DISTANCE: Final = 100
-"""Largest distance reading, in map units; longer distances, such as from the map's far corners, are clamped to it."""
+"""Largest distance reading, in map units. Larger distances occur at the map's far corners, and are clamped."""
 BEARING_SIGMA: Final = 10.0
 """Standard deviation of a bearing, in degrees."""
 

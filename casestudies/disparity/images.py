@@ -124,9 +124,10 @@ class ImagePairs:
         self._waiting: tuple[dict[int, Mapping[str, Any]], ...] = ({}, {})
 
     def add(self, side: int, message: Mapping[str, Any]) -> StereoImages | None:
-        """Add an image of camera 0 (left) or 1 (right); return the pair that it completes, or raise a BadImageError.
+        """Add an image of camera 0 (left) or 1 (right), and return the completed pair, or None.
 
-        A pair discards the older images of both cameras; newer images of one camera wait for those of the other.
+        A completed pair discards all older images of both cameras. Newer images continue to wait for their partners.
+        Raises a BadImageError if the image has no stamp, or if an image of the pair is unusable.
         """
         stamp_ns = header_stamp_ns(message)
         if stamp_ns is None:

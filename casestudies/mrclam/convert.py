@@ -39,7 +39,14 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Track:
-    """A robot's positions, by motion capture: time (s), x and y (m), heading (rad, without jumps); float64[n] each."""
+    """The positions of a robot, from motion capture. Each attribute is float64[n].
+
+    Attributes:
+        time: Times of the positions, in seconds.
+        x: Coordinates along x, in metres.
+        y: Coordinates along y, in metres.
+        heading: Headings in radians, without jumps of a full turn.
+    """
 
     time: Floats
     x: Floats

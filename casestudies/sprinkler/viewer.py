@@ -106,11 +106,11 @@ def draw(path: Path, frames: Sequence[FrameSummary]) -> None:
 
 
 class SamplesViewer:
-    """The frames that arrive while the viewer runs, from which it makes the estimates and the picture.
+    """A viewer that collects frames with their samples, and makes the estimates and the picture.
 
     Attributes:
-        frames: The frames whose samples differ from those of all earlier frames, the newest last.
-        results: The number of all results, including those whose samples are lost or repeated.
+        frames: Summaries of frames, the newest last. A frame that repeats the samples of an earlier frame is left out.
+        results: Number of all results. Results with lost or repeated samples count, too.
     """
 
     def __init__(self, count: int | None) -> None:

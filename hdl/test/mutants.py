@@ -14,13 +14,13 @@ from hdl.test.verification import Check, formal, units
 
 @dataclass(frozen=True)
 class Mutant:
-    """One mistake.
+    """One mistake in the VHDL.
 
     Attributes:
         name: Description of the mistake.
-        file: File that contains it.
-        right: Correct text, which occurs exactly once in the file.
-        wrong: Text that replaces it.
+        file: Name of the VHDL file.
+        right: Correct text. The file contains this text exactly once.
+        wrong: Text that replaces `right` in the file.
     """
 
     name: str

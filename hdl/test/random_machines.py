@@ -52,9 +52,10 @@ class Case:
 
 
 def random_case(seed: int, most_cells: int = MOST_CELLS) -> Case:
-    """Return the case of a seed, always the same one.
+    """Return a case with a random machine. Equal seeds give equal cases.
 
-    Kinds of generators, sensor modes, sharing, priors and replicas take turns from seed to seed; the rest is random.
+    Successive seeds cycle through the generator kinds, sensor modes, sharing, prior modes and numbers of replicas. All
+    other parameters are random.
     """
     random = np.random.default_rng(seed)
     kind = _KINDS[seed % len(_KINDS)]

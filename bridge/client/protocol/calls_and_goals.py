@@ -34,7 +34,7 @@ MAX_CALLS: Final = 1000
 MAX_GOALS: Final = 100
 """Maximum number of goals that this client has sent and that have not ended."""
 MAX_REQUESTS: Final = 64
-"""Maximum number of requests to services of this client that wait for its answer; further ones are refused."""
+"""Maximum number of unanswered requests to this client's services. Further requests are refused."""
 MAX_SERVED_GOALS: Final = 64
 """Maximum number of goals that this client executes at the same time. The client aborts further goals."""
 
