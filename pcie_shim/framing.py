@@ -37,11 +37,11 @@ AUTHENTICATE: Final = 7
 REPLY: Final = 1
 """Flag: the answer to the request of the same sequence number."""
 POSTED: Final = 2
-"""Flag: no acknowledgement; a refusal is still answered with ERROR."""
+"""Flag: the request gets no acknowledgement. A refused request still gets an ERROR."""
 BEGIN: Final = 4
 """Flag of PROGRAM: the payload announces the file (`ProgramBegin`)."""
 END: Final = 8
-"""Flag of PROGRAM: the file is complete; the reply follows when the board has loaded it."""
+"""Flag of PROGRAM: the file is complete. The board replies after it has loaded the file."""
 
 PROTOCOL_VERSION: Final = 1
 MAX_PAYLOAD_WORDS: Final = 8448

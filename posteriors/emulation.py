@@ -33,17 +33,17 @@ class EmulatedPosterior(Posterior):
         """Return the exact posterior for the same readings, by inference in float64.
 
         Args:
-            model: The model from which the deployment was built: a folder with `model.py`, a network file, or the
-                object that either gives. Without it, the rounded probabilities in the memories of a BM1 are used,
-                which differ from the model by the loss of quantising. A BM2 has no such probabilities.
-            settings: Parameters of `model()`, with the values that `toolchain build --set` got.
+            model: The model from which the deployment was built. It is a folder with `model.py`, a network file, or a
+                `Model` or `Question`. If `model` is None, the function uses the codes in the memories of a BM1. These
+                codes are the quantised probabilities of the model. A BM2 needs a model.
+            settings: Parameters of `model()`, with the values of `toolchain build --set`.
 
         Returns:
-            The posterior. `details["exact"]` says from what it was computed: `model`, or `codes` (the memories).
+            The posterior. `details["exact"]` is `model`, or `codes` if the codes in the memories were used.
 
         Raises:
-            PosteriorError: There is no model for a BM2, or there are settings without a model.
-            ToolchainError: The model has an error, or the deployment was not built from it.
+            PosteriorError: `model` is None, and the machine is a BM2 or there are settings.
+            ToolchainError: The model has an error, or the deployment was not built from the model.
         """
         from toolchain.analysis.emulation import joined
 

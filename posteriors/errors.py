@@ -20,4 +20,4 @@ class BadResultError(PosteriorError):
 
 
 class LabelError(PosteriorError):
-    """Raised when a posterior does not have a variable or cell; the sentence names those that it has."""
+    """Raised when a label, cell or unit does not fit a posterior. The message says what the posterior has."""

@@ -45,9 +45,10 @@ class Posterior:
     """
 
     probabilities: tuple[float, ...]
-    """Row-major over the labelled dimensions, the first slowest; they sum to 1. If the first label is
-    `replica`, these are several posteriors in sequence; each sums to 1, or to 0 if all counts of its
-    replica are 0.
+    """Probabilities of all cells, in row-major order over the dimensions of `labels`.
+
+    The sum is 1. If the first label is `replica`, the posteriors of all replicas follow each other, and
+    each of them sums to 1. If all counts of a replica are 0, its probabilities are 0.
     """
     labels: tuple[str, ...]
     """Names of the searched variables, in the order of the dimensions."""

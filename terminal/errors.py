@@ -21,8 +21,8 @@ class ExitCode(IntEnum):
 class StoppedError(BaseException):
     """A signal asked the process to end.
 
-    Like KeyboardInterrupt, it is not an `Exception`: it can be raised anywhere in the main thread, even
-    inside a library, and code that catches `Exception` must not swallow it.
+    Like KeyboardInterrupt, this class is not derived from `Exception`. The error can be raised anywhere in the main
+    thread, even inside a library. Code that catches `Exception` must not swallow it.
     """
 
     def __init__(self, exit_code: int, sentence: str) -> None:

@@ -213,10 +213,10 @@ def check_tools(simulator: Simulator) -> None:
 
 
 def compiled(image: Image, simulator: Simulator, folder: Path, on_compile: Callable[[str], None]) -> Compiled:
-    """Return the simulation of an image's hardware; compile it, unless it is in the folder already.
+    """Return the simulation of an image's hardware. If the folder does not contain the simulation, compile it first.
 
-    The folder is created; nobody else may be able to change it. `on_compile` is called with a sentence before a
-    compilation.
+    The function creates the folder if necessary. Other users must not be able to change the folder. Before a
+    compilation, `on_compile` is called with a sentence for the user.
 
     Raises:
         HardwareToolError: A tool is missing or failed, the machine exists only in emulation, or the folder

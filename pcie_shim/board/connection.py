@@ -1,7 +1,7 @@
 """Connections to the two ports of a board: frames in order, refusals, and the proof of the key.
 
-`pcie_shim.host.socket_link` shows the frames. After ERROR BAD_FRAME (the bytes are not a frame, or the frame is out of
-order), the connection is closed; after all other refusals it stays open.
+`pcie_shim.host.socket_link` shows the frames. If received bytes are not a frame, or if a frame is out of order, the
+board sends ERROR BAD_FRAME and closes the connection. After all other refusals, the connection stays open.
 """
 
 import hmac

@@ -124,13 +124,15 @@ def serve_board(
     pin: bool = True,
     on_ready: Callable[[Board], None] | None = None,
 ) -> None:
-    """Serve board number `index`, emulated by default and initially blank, until `stop`; then remove the socket files.
+    """Serve board number `index` until `stop` is set, and then remove the socket files.
 
-    With `pin`, this thread is pinned to one of its allowed cores, chosen by `index` modulo their count. Boards compute
-    for tenths of a millisecond, too short for Linux to distribute the threads woken by one host over the cores:
-    without pinning, the boards of a mini-cluster would compute one after the other. The pinned thread also gets the
-    policy SCHED_BATCH, so that it does not preempt other threads when it wakes. `link` delays the frames of hosts.
-    `on_ready` is called when both sockets are listening.
+    By default, the board is a blank emulated board. `link` delays the frames of hosts. `on_ready` is called when both
+    sockets are listening.
+
+    With `pin`, this thread is pinned to one of its allowed cores, number `index` modulo the number of cores. A board
+    computes for only tenths of a millisecond. This time is too short for Linux to distribute the boards' threads over
+    the cores. Without pinning, the boards of a mini-cluster would compute one after the other. The pinned thread also
+    gets the policy SCHED_BATCH, so a waking board does not preempt other threads.
 
     Raises:
         EndpointError: The endpoint is invalid or in use.

@@ -57,11 +57,11 @@ class Done(NamedTuple):
 
     Attributes:
         number: Doorbell number of the start or resume that has ended.
-        status: The STATUS register.
-        cycles: Cycles run in this frame.
-        compute_ns: Computing time since that start or resume, in nanoseconds.
-        results: If the board sends results, the words of the blocks in `UsedRegisters.answer`, RESULTS first; otherwise
-            empty. The bytes are valid until the link receives again.
+        status: Value of the STATUS register.
+        cycles: Number of cycles run in this frame.
+        compute_ns: Computing time since the start or resume, in nanoseconds.
+        results: Words of the blocks in `UsedRegisters.answer`, RESULTS first. The attribute is empty if the board does
+            not send results. The bytes are valid until the link receives again.
     """
 
     number: int

@@ -59,13 +59,13 @@ class Reading:
     """A published reading.
 
     Attributes:
-        index: Its index among all readings.
-        addresses: Its addresses; None if it is unusable.
-        published: Time of its publication, in seconds of the campaign's clock.
-        crowded: Whether the reading before it had no result yet, so that one may replace the other.
-        forwarded: Whether all its bytes have been sent to the stack.
-        arrived: Whether its result has arrived.
-        settled: Whether it is included in counters that have been judged.
+        index: Index among all readings, from 0.
+        addresses: Addresses of the reading, or None if the reading is unusable.
+        published: Time of publication, in seconds of the campaign's clock.
+        crowded: Whether the previous reading had no result at this time. The stack may then drop the older reading.
+        forwarded: Whether all bytes of the reading have been sent to the stack.
+        arrived: Whether the result of the reading has arrived.
+        settled: Whether the campaign has already judged counters that include this reading.
     """
 
     index: int

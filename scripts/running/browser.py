@@ -18,8 +18,9 @@ LOCK: Final = Path(__file__).parents[1] / "verifications" / "playwright.lock"
 NUMBER: Final = "Number(document.querySelector('[data-testid=frame-number]')?.innerText.replace(/\\D/g, ''))"
 """The shown frame number, in JavaScript; 0 without one."""
 NEAR: Final = 0.13
-"""Maximum distance from the boat to the mean of a posterior that has followed it, as a share of the canvas's width:
-about the posterior's own width.
+"""A posterior has followed the boat if the distance from its mean to the boat is below this value.
+
+The unit is the width of the canvas. The value is about the width of the posterior.
 """
 FOLLOW: Final = f"""
     window.paints = [];

@@ -100,9 +100,9 @@ class Feed:
 
     Attributes:
         frames: The last frames, at most `KEPT_FRAMES`.
-        truth: The newest true position (x, y) of the simulated robot; None if there is none.
-        watchers: Functions called during each change; they may only note that there is one, as it is incomplete.
-        lost: Number of frames without a posterior by reason, at most `_MAX_REASONS` of them.
+        truth: Newest true position (x, y) of the simulated robot, or None if there is none.
+        watchers: Functions called during each change. The feed is incomplete then, so a watcher must not read it.
+        lost: Number of frames without a posterior, by reason. Beyond `_MAX_REASONS` reasons, new reasons share `OTHER`.
     """
 
     def __init__(self) -> None:

@@ -272,7 +272,7 @@ class Peers:
                 self._begin_task(self._keep(peer))
 
     def _begin_task(self, work: Coroutine[Any, Any, Any], *, inside: bool = False) -> None:
-        """Start a task whose error ends the run; `inside` if it is a service in this process."""
+        """Start a task. An error of the task ends the run. `inside` marks the task of a service in this process."""
 
         async def guarded() -> None:
             try:

@@ -124,7 +124,7 @@ class StampGap:
     apart_s: float
     tolerance_s: float
     without_header: tuple[str, ...]
-    """Topics whose messages do not have a header, so that their time of receipt is used."""
+    """Topics whose messages have no header. For these topics, the time of receipt replaces the stamp."""
 
     def __str__(self) -> str:
         bare = " and ".join(self.without_header)

@@ -124,10 +124,10 @@ class ArrayField:
 
 
 def array_field(definitions: Definitions, message_type: str, path: str | None) -> ArrayField:
-    """Return the array of numbers at a path in a message type or, without a path, the only one in the type.
+    """Return the array of numbers at a path in a message type. Without a path, return the only array of the type.
 
     Raises:
-        SettingsError: There is no array of numbers at the path; or without a path, the type has none or several.
+        SettingsError: The type has no array of numbers at the path. Without a path, the type has no array or several.
     """
     arrays: dict[str, ArrayField] = {}
     waiting: list[tuple[Place, str]] = [((), ros1_type(message_type))]

@@ -86,15 +86,18 @@ class Difference:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ZScores:
-    """Counts of runs of a fixed length compared with equation 2.1: z = (n - c p) / sqrt(c p (1 - p)).
+    """Statistics of the z-scores of equation 2.1: z = (n - c p) / sqrt(c p (1 - p)).
+
+    A line counts in a cycle with probability p, and has the count n after a run of c cycles.
 
     Attributes:
-        cycles: The length c; n is the count after c cycles of a line that counts in a cycle with probability p.
-        draws: Number of independent sequences of random numbers, over which the intervals are bootstrapped: one per
-            bank of seeds, or one per reading if generators are never reset.
-        rms: Root mean square of the z-scores: 1 for independent bits, 1.6 if the variance is 2.6 times as large.
-        mean: Their mean: 0 if the counts are unbiased.
-        beyond_three: Share of z-scores below -3 or above 3; 0.0027 for a normal distribution.
+        cycles: Length c of all runs.
+        counts: Number of z-scores.
+        draws: Number of independent sequences of random numbers. There is one per bank of seeds, or one per reading if
+            generators are never reset. The intervals are bootstrapped over these sequences.
+        rms: Root mean square of the z-scores. It is 1 for independent bits, and 1.6 for 2.6 times their variance.
+        mean: Mean of the z-scores. It is 0 if the counts are unbiased.
+        beyond_three: Share of z-scores below -3 or above 3. It is 0.0027 for a normal distribution.
     """
 
     cycles: int

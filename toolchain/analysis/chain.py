@@ -1,10 +1,11 @@
-"""The Markov chain of a BM2, exactly: its law (the distribution of its state), cycles and correlations, for few bits.
+"""Exact analysis of the Markov chain of a BM2 with few bits: law, cycles and correlations.
 
-In a move, a BM2 points at a bit (or several); every cycle, each CDE whose factor contains the bit draws 0 or 1, until
-all agree. With ideal random numbers, the probability that they agree on 1 in a cycle is the product of their
-probabilities of a 1, and on 0 the product of the complements. This gives the transition matrix of a sweep, and with it
-everything that long runs approach. The codes are those of the machine, so the effects of quantising and clipping are
-included. The samples are the states after each sweep, even if a machine takes one after every move.
+The law is the distribution of the chain's state. In a move, a BM2 points at one or several bits. In every cycle of a
+move, each CDE whose factor contains the bit draws 0 or 1. The bit is written when all these CDEs agree. If random
+numbers are ideal, the probability that all CDEs draw 1 is the product of their probabilities of a 1. The probability
+that all draw 0 is the product of the complements. These products give the transition matrix of a sweep. The matrix
+gives all values that long runs approach. The codes are those of the machine, so the effects of quantising and clipping
+are included. A sample is the state after a sweep, even if the machine takes a sample after every move.
 """
 
 import itertools

@@ -1,8 +1,8 @@
 """Logic and memories of a machine in an FPGA, as the sum over the units of its VHDL (see `Of`).
 
-A unit's cost is fitted to the synthesis of small machines by GHDL and yosys (`scripts/verify resources
---calibrate`; docs/how-to/design-space.md); registers are counted from the VHDL. Tables go into memory blocks
-(M20K); those that no longer fit there go into memory LABs, which are made of logic.
+`scripts/verify resources --calibrate` synthesises small machines with GHDL and yosys, and fits the cost of each unit
+(docs/how-to/design-space.md). Registers are counted from the VHDL. Tables go into memory blocks (M20K). If all memory
+blocks are full, the other tables go into memory LABs, which are made of logic.
 """
 
 import math

@@ -1,8 +1,10 @@
 """The steps from a model to a deployment (thesis 3.4).
 
 BM1: model, options ──▶ plan_machine ──▶ quantise ──▶ whole_machine ──▶ split ──▶ images ──▶ describe ──▶ files
-                        └─▶ board_layout (lines and interface of each board, before tables are computed)
+                        └─▶ board_layout
 BM2: network, options ──▶ plan_bm2 ──▶ chain_machines ──▶ images ──▶ describe ──▶ files
+
+`board_layout` determines the lines and the interface of each board, before tables are computed.
 """
 
 import hashlib

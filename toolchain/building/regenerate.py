@@ -78,11 +78,12 @@ def regenerate_memories(
     flags: ModelSection | None = None,
     build_date: str = "",
 ) -> Changes:
-    """Write the memory files and a BM1's `bm1_parameters.vhd` again: from the images, or with new tables from a model.
+    """Write the memory files again, and for a BM1 also `bm1_parameters.vhd`.
 
-    With a model, which was read with `flags`, the images (dated `build_date`), the report and the hashes of
-    `deployment.toml` are written too, and the columns get the order of the model. Sizes, widths, topics and the paths
-    in their messages do not change.
+    Without a model, the tables come from the images. If a model is given, `flags` are the flags with which it was read.
+    The function then computes the tables from the model, and also writes the report, the hashes of `deployment.toml`
+    and the images with the date `build_date`. The columns get the order of the model. Sizes, widths, topics and paths
+    in messages do not change.
 
     Raises:
         BuildError: The model now needs another machine, so a new build is necessary.

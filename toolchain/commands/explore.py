@@ -116,8 +116,8 @@ def explore(
 ) -> None:
     """Sweep over machines for a model: accuracy against cycles and ALMs, with the Pareto front.
 
-    For example `toolchain explore casestudies/boat --partitions 4 --prob-bits 6,8 --plot boat.png`; after
-    Ctrl-C, the same command resumes the sweep, whose points are in the results file.
+    For example `toolchain explore casestudies/boat --partitions 4 --prob-bits 6,8 --plot boat.png`. If you repeat the
+    command after Ctrl-C, the sweep continues after the points in the results file.
     """
     from toolchain.analysis import sweep as sweeps
     from toolchain.analysis.logic import device_named

@@ -12,16 +12,16 @@ _SHOWN = 60
 
 
 def to_address(variable: Variable, value: object) -> int | None:
-    """Return the address of a reading in its column, from 0 to `variable.values - 1`; None for a missing reading.
+    """Return the address of a reading in its column, from 0 to `variable.values - 1`, or None for a missing reading.
 
-    `None` (null or an absent field), NaN and an empty array are missing readings. Booleans are 0 and 1. Strings
-    are never numbers, but may be names of states.
+    `None`, NaN and an empty array are missing readings. JSON null and an absent field are `None`. Booleans are 0 and 1.
+    A string is never a number, but may be the name of a state.
 
     Raises:
         ReadingMissingError: The reading is missing and `on_missing` is `error`.
-        NotANumberError: The reading is a string, an object or a non-empty array.
-        ValueOutOfRangeError: The reading is out of range and `on_range` is `error`; or it is infinite, the variable
-            is periodic, and `on_range` is `clamp`.
+        NotANumberError: The reading is an object, a non-empty array, or a string that names no state.
+        ValueOutOfRangeError: The reading is out of range and `on_range` is `error`. If the variable is periodic and
+            `on_range` is `clamp`, an infinite reading also raises this error.
     """
     if value is None:
         return _missing(variable, "is absent or null (NaN is null in JSON)")

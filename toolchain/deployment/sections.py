@@ -253,7 +253,7 @@ class Variable(Section):
 
 
 class Dimension(Section):
-    """`[[searched]]`: one searched variable, a dimension of the grid of lines; the first one varies slowest."""
+    """`[[searched]]`: a searched variable, as a dimension of the grid of lines. The first dimension varies slowest."""
 
     label: Name
     size: int = Field(ge=1)
@@ -440,7 +440,7 @@ class Output(Section):
 
 
 class TopicsSection(Section):
-    """`[topics]`: whether to publish each topic for robot tools; None: if it fits the searched variables."""
+    """`[topics]`: whether to publish each topic for robot tools. None: if the topic fits the searched variables."""
 
     counts: bool | None = None
     posterior: bool | None = None

@@ -30,11 +30,12 @@ def load_model(case: Path, settings: Mapping[str, str]) -> Model:
 
 
 def load_question(case: Path, settings: Mapping[str, str]) -> Model | Question:
-    """Return the model or the question of a folder with a `model.py`, or of that file itself, or raise a ModelError.
+    """Return the model or the question of a case study, or raise a ModelError.
 
-    The file defines `model(...)`, which returns a `toolchain.models.Question` or a `toolchain.models.Model`, and can
-    import modules in its folder. The settings are values for the parameters of `model()` as text; each is converted to
-    the annotated type of its parameter (int, float, bool, str, Path, an Enum, a Literal).
+    `case` is a folder with a `model.py`, a path of a `model.py`, or the name of an installed model. The file can import
+    modules in its folder. The file defines a function `model`. This function returns a `toolchain.models.Question` or a
+    `toolchain.models.Model`. `settings` are the arguments of `model`, as text by name. Each argument is converted to
+    the annotated type of its parameter: int, float, bool, str, Path, an Enum or a Literal.
     """
     path = existing_model_path(case)
     folder = str(path.parent.resolve())

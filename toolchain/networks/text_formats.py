@@ -47,7 +47,10 @@ class Scanner:
         return NetworkFileError(sentence, path=self._path, line=line)
 
     def next(self) -> str:
-        """Consume the next token: a word, a quoted word without its quotes, or a sign; empty at the end."""
+        """Consume and return the next token. Return an empty string at the end of the text.
+
+        A token is a word, a quoted word without its quotes, or a sign.
+        """
         match = self._token.match(self._text, self._end)
         if match is None:  # the last alternative matches any character
             raise AssertionError

@@ -1,8 +1,8 @@
 """Memory initialisation files (MIF), the text files with the initial contents of an FPGA's memories (thesis 3.2).
 
-Files are written in one canonical form, with one hexadecimal entry per line, and read in every form of
-Quartus: five radices, runs (`A : D0 D1;`), ranges (`[A0..A1] : D;`) and both kinds of comments. The random
-numbers of `rng = table` are generated, or read from a user's MIF.
+Files are written in one canonical form, with one hexadecimal entry per line. Files are read in every form of
+Quartus, with five radices and both kinds of comments. Runs (`A : D0 D1;`) and ranges (`[A0..A1] : D;`) are read, too.
+The random numbers of `rng = table` are generated, or read from a user's MIF.
 """
 
 import re

@@ -127,7 +127,7 @@ def check_status(stack: Stack) -> None:
 
 
 def check_silent_board(stack: Stack) -> None:
-    """Suspend a board's process, so that it is silent as without power, and resume it; suspend it again and kill it."""
+    """Suspend a board's process, as if it lost power, and resume it. Then suspend the process again and kill it."""
 
     def silent(then: str) -> None:
         until(lambda: "board2" in stack.processes(), lambda: "status does not show board2")
