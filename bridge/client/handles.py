@@ -331,8 +331,7 @@ class Publication(Handle):
             DisconnectedError: There is no connection now, or the publication or the client is closed.
             SlowPeerError: The server did not accept the message in time, or `queue_size` messages are already waiting.
             MessageTooLargeError: The message is larger than `max_size`, or than the known limit of the server.
-                `bridge.hub` announces its limit. The client learns the limit of another server when that server closes
-                the connection because of a large message.
+                `bridge.hub` announces its limit. Another server reveals its limit by closing the connection once.
             MessageTypeError: The message has a field that its type does not have, or an array of another shape.
             EncodeError: The message cannot be sent as JSON. If a value is NaN or infinite, the error names the field.
         """

@@ -1,8 +1,8 @@
-"""Prediction of the frames for which a BM1 has no posterior, and of the options that avoid such frames.
+"""Prediction of lost frames, for which a BM1 has no posterior, and of options that avoid lost frames.
 
-Such a frame is lost. The prediction uses the codes of the BM1, before it runs. A frame is lost if every line has a code
-0, or if no line counts in any cycle of the frame. A sample of frames is drawn from the model. The probability that a
-frame is lost is (1 - u)^cycles, where u is the probability that some line counts in a cycle.
+The prediction uses the codes of the BM1, before it runs. A frame is lost if every line has a code 0, or if no line
+counts in any cycle of the frame. A sample of frames is drawn from the model. The probability that a frame is lost is (1
+- u)^cycles, where u is the probability that some line counts in a cycle.
 
 All lines use one random number per column, so u is the volume of a union of boxes. Each line has a box, whose sides are
 the codes of the line's cells. The method of Karp and Luby estimates the volume. It draws points in the boxes, and each
