@@ -16,7 +16,7 @@ entity bm_register_block is
   port (
     clk_i             : in    std_logic;                      -- clock
     rst_i             : in    std_logic;                      -- reset of the board
-    write_i           : in    std_logic;                      -- write the word; it must be allowed
+    write_i           : in    std_logic;                      -- write the word; only for allowed accesses
     read_i            : in    std_logic;                      -- read the word
     word_i            : in    std_logic_vector(7 downto 0);   -- index of the word: address / 4
     data_i            : in    std_logic_vector(31 downto 0);  -- data to write

@@ -42,7 +42,7 @@ class CommandLine(typer.Typer):
     def add_later(self, name: str, module: str, *, purpose: str) -> None:
         """Add a subcommand whose module is imported only when a user names the subcommand.
 
-        The subcommand is the module's command line, `app`. If `app` is a group, `MODULE:NAME` adds one command of `app`.
+        The subcommand is the module's command line `app`. If `app` is a group, `MODULE:NAME` adds one command of `app`.
         """
         module, _, part = module.partition(":")
 

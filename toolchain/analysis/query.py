@@ -116,7 +116,7 @@ def answer(
     known: Mapping[str, str],
     machine: MachineChoice | None = None,
 ) -> Answer:
-    """Return the exact posterior of the searched variables for known states. With `machine`, add the machine's posterior.
+    """Return the exact posterior of the searched variables for known states. With `machine`, add its posterior.
 
     Raises:
         ToolchainError: A variable or state does not exist, or the known states are impossible together. It is also
