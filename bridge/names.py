@@ -25,7 +25,7 @@ _CACHED_TYPES = 1024
 def split_type(name: str) -> tuple[str, str, str]:
     """Return the package, the kind and the name of a type.
 
-    The kind is `msg`, `srv` or `action`. It is empty if `name` has the ROS 1 form, `package/Type`.
+    The kind is `msg`, `srv` or `action`. The kind is empty if `name` has the ROS 1 form, `package/Type`.
     """
     match = _TYPE.fullmatch(name) if len(name) <= MAX_NAME else None
     if match is None:

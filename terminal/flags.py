@@ -4,7 +4,7 @@
         uri: Annotated[str, Flag(...)] = Field(...)  ──▶      listen --uri URI --plot
 
 Typer reads the flags of a command from the signature of a function. `expanded` replaces a parameter in the signature
-by several flags. When the command is called, the values of the flags are composed to the value of the parameter.
+by several flags. When the command is called, `expanded` makes the parameter's value from the values of the flags.
 """
 
 import functools

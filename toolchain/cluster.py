@@ -5,9 +5,9 @@
     batches of numbers, 2 s at most each ─────┼─────────────▶ work(number) for each number
     keep(number, result) ◀────────────────────┴────────────── as batches are done, in any order
 
-The job contains the tables, and is sent once. A piece of work is only a number. Its result depends only on the job and
-the number, not on the worker or the order of the pieces. A caller that keeps results on disk can resume an interrupted
-job with the numbers that have no result yet.
+The job contains the tables, and is sent once. A piece of work is only a number. The result of a piece depends only on
+the job and the number, not on the worker or the order of the pieces. A caller that keeps results on disk can resume an
+interrupted job with the numbers that have no result yet.
 """
 
 import asyncio

@@ -1,10 +1,10 @@
 """Absent fields of a message, filled with default values, so that every subscriber receives all fields.
 
-The reference server builds a ROS message from the JSON, and forwards the ROS message. Its code is `_to_object_inst` in
-rosbridge_library/internal/message_conversion.py. An absent field has the default value of the ROS message. The absent
-stamp of a `std_msgs/Header` is the time of receipt. If the whole header is absent, its stamp is the time of receipt
-too, as the specification says (ROSBRIDGE_PROTOCOL.md, 3.3.3). Unlike the reference server, the hub does not check
-present values.
+The reference server builds a ROS message from the JSON, and forwards the ROS message (`_to_object_inst` in
+rosbridge_library/internal/message_conversion.py). The hub fills fields as the reference server does. An absent
+field has the default value of the ROS message. The absent stamp of a `std_msgs/Header` is the time of receipt. If the
+whole header is absent, its stamp is the time of receipt too, as the specification says (ROSBRIDGE_PROTOCOL.md, 3.3.3).
+Unlike the reference server, the hub does not check present values.
 
     {"op":"publish","topic":"/t","msg":{"data":[1.5]}}                                     as received
     {"op":"publish","topic":"/t","msg":{"data":[1.5],"layout":{"dim":[],"data_offset":0}}} as forwarded

@@ -106,7 +106,7 @@ def access_policy(
     insecure: bool,
     danger: str,
 ) -> AccessPolicy:
-    """Return the access policy of the flags, or raise a SettingsError.
+    """Return the access policy of the flags, or raise a SettingsError or a HubError.
 
     `files` are the files of the certificate, the key and the tokens. Unless `insecure` is set, a `host` beyond
     loopback needs all three files.

@@ -236,7 +236,7 @@ class RunService(ABC):
         self._logs_frames = settings.log_level == "debug"
 
     async def run(self) -> int:
-        """Serve until cancelled, or until an error. Errors are also sent to the master.
+        """Serve until cancelled, or until an error. Unless the error is a bug, the service reports it to the master.
 
         Raises:
             OutdatedError: A master requires the folder's present deployment, but this service loaded an earlier one.

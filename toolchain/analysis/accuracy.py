@@ -228,8 +228,9 @@ class _Reading(NamedTuple):
         without: Number of runs without a posterior.
         overflow: Number of runs that ended with an overflow.
         prior: uint16[lines], the prior that the filter wrote for this reading, or None without a filter.
-        differences: Results of `_differences` for the machine against exact inference from the codes. If there is a
-            model, results for the codes against the model, and for the machine against the model, follow.
+        differences: Results of `_differences`. The first compares the machine with exact inference from the codes.
+            If there is a model, the second compares the codes with the model, and the third compares the machine
+            with the model.
     """
 
     is_likely: bool

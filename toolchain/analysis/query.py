@@ -116,7 +116,9 @@ def answer(
     known: Mapping[str, str],
     machine: MachineChoice | None = None,
 ) -> Answer:
-    """Return the exact posterior of the searched variables for known states. With `machine`, add its posterior.
+    """Return the exact posterior of the searched variables for known states.
+
+    If `machine` is given, the answer also has the posterior of that machine.
 
     Raises:
         ToolchainError: A variable or state does not exist, or the known states are impossible together. It is also

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 _FLAGS: Final = {"tolerance_s": "--tolerance", "path": "--prior-path", "shared": "--per-cell"}
-"""Names of the flags that are not named after their field, by field."""
+"""The flag of each field whose flag has another name than the field."""
 
 
 URI: Final = typer.Option(help="rosbridge server of the readings.", metavar="ws://HOST:PORT|robot:NAME")

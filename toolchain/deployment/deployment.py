@@ -214,8 +214,8 @@ class Deployment(DeploymentFile):
 def deployment_hash(deployment: DeploymentFile) -> str:
     """Return the SHA-256 (hexadecimal) of the part of a deployment that follows from the model.
 
-    The hash leaves out URIs, endpoints, units of readings and similar keys, so that a user can edit them for another
-    robot. Any edit that contradicts the tables in the images changes the hash.
+    The hash leaves out URIs, endpoints, units of readings and similar keys, so that a user can edit these keys for
+    another robot. Any edit that contradicts the tables in the images changes the hash.
     """
     content = deployment.model_dump(
         mode="json",
