@@ -74,8 +74,7 @@ class BoardResult(msgspec.Struct, frozen=True, array_like=True, tag="board"):
         reason: Stop reason, a key of `MachineKind.reasons`. With replicas, the replicas' `joint_reason`.
         replica_cycles: Cycles of each replica. Empty if the board has a single machine.
         replica_reasons: Stop reason of each replica. Empty if the board has a single machine.
-        kept: Further results that `FrameCourse.conclude` adds for `MachineKind.infer`. Each kind of machine
-            chooses the encoding.
+        kept: Further results that `FrameCourse.conclude` adds for `MachineKind.infer`, in the kind's encoding.
     """
 
     words: bytes

@@ -87,7 +87,7 @@ async def serve_hub(
 
     Args:
         host: the address to listen on. Without tokens and TLS, everybody who can reach this address may publish
-            to your robot. A loopback address is reachable only from this machine.
+            to your robot.
         port: the port to listen on, or 0 for any free port.
         limits: bounds on clients and messages.
         access: access control and TLS. By default, every program and the web pages of this machine may connect.
