@@ -3,9 +3,10 @@
 Independence is tested on the moral graph, from which the searched and the fixed symbols are removed. Omitted symbols
 are eliminated one by one, exactly, in float64.
 
-The order of elimination is planned in advance by two rules. By the first rule, the next symbol is the one that needs
-the smallest table (min-weight). By the second rule, it is the one that joins the fewest pairs of symbols (min-fill).
-The order with the smaller tables is used. If both orders need a table above the limit, the question is refused.
+The order of elimination is planned in advance by two rules. By the first rule, the next symbol is the symbol that
+needs the smallest table (min-weight). By the second rule, the next symbol is the symbol that joins the fewest pairs
+of symbols (min-fill). The order with the smaller tables is used. If both orders need a table above the limit, the
+question is refused.
 """
 
 import math

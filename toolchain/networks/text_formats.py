@@ -377,7 +377,7 @@ _UAI_COMMENTS: Final = r"#[^\n]*|(?m:^c\b[^\n]*)"
 def read_uai(data: bytes, builder: NetworkBuilder) -> None:
     """Read a UAI file. A preamble (kind, sizes, variables of each factor) is followed by the numbers of each factor.
 
-    By the format, a factor's last variable varies fastest. In a BAYES file, this variable is the child.
+    In the format, a factor's last variable varies fastest. In a BAYES file, this variable is the child.
 
     Two programs deviate from the format. pyagrum 3.3.1 writes the first parent fastest. pgmpy 0.1 to 1.1 lists the
     variables in the format's order, but writes the numbers so that the first variable varies fastest and the child
