@@ -7,8 +7,8 @@ a line's cells, and counts the ones. A line with a code 0 cannot count, and is o
 Cycles are run in blocks of 512. If a counter reaches the target in a block, the words of the counter's line show the
 exact cycle. The kernel then counts the block again up to this cycle. Replicas are run one after the other.
 
-If each frame restarts the generators from a bank, the words of the first cycles depend only on the bank. The kernel
-caches these words for later frames.
+If frames restart the generators from a bank, the words of the first cycles are equal in all frames with this bank. The
+kernel caches these words.
 """
 
 from typing import Final

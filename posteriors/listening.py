@@ -34,7 +34,7 @@ QUEUE_SIZE: Final = 64
 FIRST_TIMEOUT: Final = 30.0
 """Default timeout for the first posterior, in seconds."""
 _DISORDER_NS: Final = 50_000_000
-"""Maximum nanoseconds by which a report, although published first, may arrive after its posterior."""
+"""Maximum delay of a report after its posterior, in ns: reports are published first, but may arrive second."""
 _REPORT_TIMEOUT: Final = 1.0
 """Seconds that a posterior waits for its report."""
 
@@ -126,10 +126,12 @@ class Posteriors:
         return await self._within(timeout, self.__anext__)
 
     async def next_frame(self, timeout: float | None) -> FrameOutcome:
-        """Wait for one frame: return its posterior, or its `FrameReport` with the reason if it has none.
+        """Wait for one frame, for at most `timeout` seconds, or without a limit if `timeout` is None.
+
+        Returns the frame's posterior. If the frame has no posterior, returns its `FrameReport` with the reason.
 
         Raises:
-            NoResultError, BadResultError, DisconnectedError, ConcurrentReadError: As for `next`.
+            NoResultError, BadResultError, DisconnectedError, ConcurrentReadError: The conditions are those of `next`.
         """
         return await self._within(timeout, self._take)
 
@@ -263,27 +265,27 @@ def listen(
 ) -> int:
     """Call a function with each posterior, in this thread, without asyncio.
 
-    The connection runs in its own thread, so a slow function loses posteriors, the oldest first, but not the
+    The connection runs in its own thread. If the function is too slow, it loses the oldest posteriors, but not the
     connection. A lost connection is restored. Ctrl-C ends the loop normally.
 
     Args:
-        server: The URI of a rosbridge server or `robot:NAME`, or an unopened `connect(...)` with further options
-            (a token, a proxy).
-        function: Called with each `Posterior`. Its exceptions end the loop and propagate; returning False
-            also ends the loop.
-        count: Number of posteriors after which to return; None for no limit.
-        first_timeout: Seconds until the first posterior; None for no limit.
-        timeout: Seconds between two posteriors; None for no limit.
-        topic: As in `posteriors`.
-        frame_topic: As in `posteriors`.
-        deployment: As in `posteriors`.
-        queue_size: As in `posteriors`.
+        server: The URI of a rosbridge server, or `robot:NAME`. For further options, such as a token or a proxy, pass
+            an unopened `connect(...)`.
+        function: Called with each `Posterior`. If the function returns False, the loop ends. If it raises an
+            exception, the loop ends, and the exception propagates.
+        count: Number of posteriors after which to return, or None for no limit.
+        first_timeout: Seconds until the first posterior, or None for no limit.
+        timeout: Seconds between two posteriors, or None for no limit.
+        topic: Topic of the posteriors.
+        frame_topic: Topic of the frame reports.
+        deployment: The model's name, to ignore frames of other stacks on the server, or None.
+        queue_size: Maximum number of posteriors that wait for the function.
 
     Returns:
         The number of posteriors passed to the function.
 
     Raises:
-        NoResultError: None arrived in time.
+        NoResultError: No posterior arrived in time.
         BadResultError: A message on the topic is not a posterior.
         BridgeError: The server is not reachable, or is not a rosbridge server.
     """

@@ -72,8 +72,8 @@ def model(
         height: Number of cells along y in [-7, 7] m.
         floor: Smallest likelihood of a reading, relative to the most likely reading. The floor allows for outliers.
             Codes of 8 bits round a floor of 1e-3 to 0. A single outlier then makes every line impossible.
-        range_step: Step between distinguishable ranges, in metres. The smallest range is 0; longer readings than the
-            largest range are clamped.
+        range_step: Step between distinguishable ranges, in metres, from 0. Readings beyond the largest range are
+            clamped.
         range_values: The number of distinguishable ranges.
         bearing_values: The number of distinguishable bearings in a turn. Readings are in radians, and may include
             whole turns.
