@@ -152,9 +152,9 @@ class Start:
 
     Attributes:
         addresses: One address per sensor column, columns 1..N. A missing reading has the column's top address.
-            If the machine has inputs per cell or several replicas, this is an array of integers of the shape
-            `parameters.input_shape`. The array contains addresses, or codes if `sensor_mode` is `threshold`. All
-            lines of a missing reading have the top value.
+            If the machine has inputs per cell or several replicas, `addresses` is an array of integers of the shape
+            `parameters.input_shape`. The array contains addresses, or codes if `sensor_mode` is `threshold`. A
+            missing reading has the top value on all lines.
         prior_address: Row of the prior's table. If the machine has replicas, an integer is the row of all replicas,
             and a tuple has one row for each replica.
         prior_codes: uint16[lines], a written prior, for a machine with `prior_mode` = `written`. An array

@@ -230,7 +230,7 @@ class Subscription(Handle):
 
         Raises:
             NoMessageError: No message arrived in time. The error names the topic, the server, the timeout and the
-                probable reason. To find the reason, rosapi may be asked, for up to half a second more.
+                probable reason. The client may ask rosapi for the reason, which takes up to half a second more.
             TopicLeftOutError: The topic's messages are too large for the connection.
             DisconnectedError: The subscription or the client is closed.
             ConcurrentReadError: Another task is already waiting.

@@ -1,7 +1,7 @@
 """The boat's map, its sensors with their noise, and their ROS messages.
 
-The problem is the localisation of a boat from thesis 2.1.2.1. The numbers are from its published version (Bessiere et
-al., Bayesian Programming, ch. 7). Distances are in map units, and bearings are in degrees.
+The map and the sensors are those of thesis 2.1.2.1. The numbers are from the published version of this example
+(Bessiere et al., Bayesian Programming, ch. 7). Distances are in map units, and bearings are in degrees.
 
 The messages `boat_msgs/Raw` and `boat_msgs/Sensors` have named fields and a time stamp. But a ROS server accepts only
 types of installed packages. To a server without `boat_msgs`, the readings are sent as std_msgs/Float64MultiArray, in

@@ -1,4 +1,4 @@
-"""The services of a run, and the side of a local socket that is in the service.
+"""The services of a run, and their end of the local socket to the master.
 
 A service accepts one master at a time:
 

@@ -15,10 +15,10 @@ The state machine has no socket and no clock. In this example of a connection, `
     unsubscribe()        ->  {"op": "unsubscribe", "id": "subscribe:/pose:2", "topic": "/pose"}
     lost()                   drops calls, goals and requests, and keeps everything else for restore()
 
-rosbridge has no handshake and no acknowledgements. If a server refuses an operation, it sends a status message at
-most. So the core stores the program's subscriptions, advertisements and services, and sends them again on a new
-connection. Messages may also be encoded as CBOR, or be split into fragments. The goal of an action works like a call,
-with feedback before the result.
+rosbridge has no handshake and no acknowledgements. If a server refuses an operation, the client gets a status message
+at most. So the core stores the program's subscriptions, advertisements and services. On a new connection, the core
+sends all of them again. Messages may also be encoded as CBOR, or be split into fragments. The goal of an action works
+like a call, with feedback before the result.
 
 Source: the rosbridge protocol, version 2 (https://github.com/RobotWebTools/rosbridge_suite). Servers deviate from the
 protocol as described in `docs/reference/rosbridge-differences.md`.
