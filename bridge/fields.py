@@ -52,13 +52,14 @@ class Field:
             )
 
     def value(self, message: dict[str, Any]) -> tuple[bool, Any]:
-        """Look up the variable.
+        """Look up the variable in a message.
 
         Returns:
-            True if the message has the variable, and its unchanged value (None if it is missing or null).
+            True if the message has the variable, and its unchanged value. The value of a missing variable is None.
 
         Raises:
-            FieldAmbiguousError: The message has several fields with this bare name, and no earlier message had any.
+            FieldAmbiguousError: Several fields of the message have the variable's bare name, and the name was in no
+                earlier message.
         """
         # A bare name is searched until it is found, and then has the same place in all messages.
         place = self.place

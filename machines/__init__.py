@@ -48,7 +48,7 @@ def make_bm2_kernel(machine: "BM2Machine") -> "BM2Kernel":
 
 
 def warm_up() -> None:
-    """Load the fast kernels (the first time, compile them) before the first frame; forked processes share them."""
+    """Load the fast kernels before the first frame; the first call compiles them. Forked processes share them."""
     from machines import bm2_fast, fast
 
     fast.warm_up()

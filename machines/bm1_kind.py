@@ -360,7 +360,7 @@ class _OnHost(HostMachine):
         )
 
     def _plain_words(self, frame: FrameInput) -> bytes:
-        """Return the words of SENSORS, which are the same on every board."""
+        """Return the words of the SENSORS registers. All boards get the same words."""
         addresses, sensors = frame.addresses, self._parameters.sensors
         if len(addresses) != sensors:
             raise StartError(f"The frame has {len(addresses)} readings; this machine has {sensors} sensors")

@@ -87,10 +87,11 @@ def searched_values(parameters: BM2Parameters, stream: npt.NDArray[np.uint32]) -
 
 
 def estimate(chains: Sequence[BoardSamples]) -> ChainEstimate:
-    """Return the estimate from the chains of all boards.
+    """Return the estimate of the posterior from the chains of all boards.
 
-    Boards that timed out or have no sample are left out. The counts of the others are added, because all have drawn
-    the same number of samples. But if a board has reached its maximum number of cycles, all get the same weight.
+    A board is left out if it timed out or has no sample. The counts of the remaining boards are added, because each
+    board has drawn the same number of samples. If a board reached its maximum number of cycles, the numbers may differ.
+    Then each board's counts are divided by their sum, which gives every board the same weight.
     """
     left_out = tuple(
         board

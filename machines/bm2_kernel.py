@@ -141,7 +141,7 @@ class BM2Kernel(ABC):
 
 
 def check_bm2_start(parameters: BM2Parameters, start: BM2Start) -> None:
-    """Raise a StartError, which names the value and its range, if a start does not fit the machine."""
+    """Raise a StartError if a start does not fit the machine. The error names the wrong value and the allowed range."""
     for name, value, lowest, highest in (
         ("state", start.state, 0, (1 << parameters.state_bits) - 1),
         ("known", start.known, 0, (1 << parameters.state_bits) - 1),

@@ -83,7 +83,7 @@ class BM2Kind(MachineKind):
         return BM2Machine(parameters, tables, supports, sections.get("rng"))
 
     def registers(self, parameters: BM2Parameters) -> UsedRegisters:
-        """Return the registers of a board; its number of lines is 1, because it runs one chain of the whole model."""
+        """Return the registers of a board. The board has one line, because it runs one chain of the whole model."""
         words = parameters.state_words
         if parameters.stream * words > STREAM_WORDS_MAX:
             raise ParameterError(
@@ -434,7 +434,10 @@ class _OnHost(HostMachine):
         return _Course(*self.starts(frame), self._machines)
 
     def starts(self, frame: FrameInput) -> tuple[Sequence[Blocks], FrameSettings]:
-        """Return the blocks of each board and the settings of a whole frame; a StartError if it does not fit."""
+        """Return the blocks to write to each board, and the settings of the frame for all boards.
+
+        Raises a StartError if the frame does not fit the machine.
+        """
         parameters = self._parameters
         check_frame_value("The number of samples", frame.target_count, 1, SAMPLES_MAX)
         check_frame_value("The most cycles", frame.max_cycles, 1, CYCLES_MAX)

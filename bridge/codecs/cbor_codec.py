@@ -195,10 +195,10 @@ def typed_array(numbers: Sequence[Any], elements: str) -> cbor2.CBORTag:
 
 
 def with_arrays(value: Any) -> Any:
-    """Replace every list of numbers by an array, in place, in a message that arrived as JSON.
+    """In a message that arrived as JSON, replace every list of numbers by an array, in place.
 
-    Floats become float64, with NaN for null; integers become int64, or uint64 if int64 is too small; bytes
-    become uint8. All other lists, including numbers mixed with booleans, remain lists.
+    A list with a float becomes float64, and null becomes NaN. A list of integers becomes int64, or uint64 if int64 is
+    too small. Bytes become uint8. All other lists, including numbers mixed with booleans, remain lists.
     """
     import numpy as np
 

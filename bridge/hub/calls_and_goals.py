@@ -130,7 +130,7 @@ class _Exchange:
         self._numbers = itertools.count(1)
 
     def _offer(self, client: Client, operation: Operation, type_name: str) -> None:
-        """Add a client's offer of a name, which replaces any other client's offer of it."""
+        """Store a client's offer of a service or an action, and replace another client's offer of the same name."""
         name = checked_name(text(operation, self.kind))
         key, names = absolute(name), self._names_of(client)
         if key not in names and len(names) >= self._limits.services_per_client:

@@ -163,7 +163,10 @@ class MessageDefinitions:
             ) from None
 
     def full_text(self, type_name: str) -> str:
-        """Return the definitions of a type and its nested types, as in bag files, or raise a RefusedOperationError."""
+        """Return the definitions of a type and its nested types as text, in the format of bag files.
+
+        Raises a RefusedOperationError if the type's fields are unknown.
+        """
         text = self._texts.get(type_name)
         if text is None:
             store, known = self._known(type_name)

@@ -39,7 +39,7 @@ class _Entry:
 
 
 class Lane:
-    """The messages of one subscription in its client's outbox; only the outbox changes the lane."""
+    """The queued messages of one subscription, in the outbox of its client. Only the outbox changes a lane."""
 
     __slots__ = ("dropped", "fragment_size", "held", "next_time", "queue_length", "queued", "throttle")
 

@@ -116,7 +116,7 @@ class WebSocketTransport(asyncio.Protocol):
         raise NotImplementedError
 
     def close_expected(self) -> None:
-        """Start the timeout after which the connection is aborted unless the peer has ended it."""
+        """Start a timeout. If the peer has not ended the connection by then, the connection is aborted."""
         raise NotImplementedError
 
     def connection_ended(self, exc: Exception | None) -> None:

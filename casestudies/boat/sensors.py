@@ -151,7 +151,7 @@ def true_pose(x: float, y: float, head: dict[str, Any], heading: float = 0.0) ->
 
 
 def compass(heading: float, head: dict[str, Any]) -> dict[str, Any]:
-    """Return a heading in radians as a sensor_msgs/Imu; a covariance of -1 marks what is not measured."""
+    """Return a heading in radians as a sensor_msgs/Imu. A covariance of -1 marks a quantity that is not measured."""
     nothing = {"x": 0.0, "y": 0.0, "z": 0.0}
     unknown = [-1.0, *[0.0] * 8]
     return {

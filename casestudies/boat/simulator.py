@@ -88,7 +88,7 @@ class Boat:
     """
 
     def __init__(self, seed: int, speed: float) -> None:
-        """Put the boat in the middle of the map; `speed` is its top speed, in map units per second."""
+        """Put the boat in the middle of the map. The boat's top speed is `speed`, in map units per second."""
         self._random = random.Random(seed)
         self._speed = speed
         self.x = (MAP_LOW + MAP_HIGH) / 2

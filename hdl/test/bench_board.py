@@ -55,7 +55,7 @@ _NOT_COMPARED: Final = (rm.CAP_SPEED, rm.COMPUTE_NS, rm.COMPUTE_NS + 4)
 
 
 class SlowKernel:
-    """A kernel that runs one cycle and pauses, so that the emulated board can be accessed while it runs."""
+    """A kernel that pauses after each cycle. The tests can thus access the emulated board while the machine runs."""
 
     def __init__(self, machine: BM1Machine) -> None:
         self.kernel: BM1Kernel = reference_kernel(machine)
@@ -344,7 +344,7 @@ class Session:
         return drawn
 
     async def write_settings(self) -> None:
-        """Write target, limits and bank, often chosen so that two stop reasons occur in the same cycle."""
+        """Write random values of target count, limits and bank. Often two stop reasons then occur in one cycle."""
         p, both = self.parameters, self.both
         target = int(
             self.random.choice(

@@ -118,7 +118,7 @@ def _tables(
 def codes(
     random: np.random.Generator, parameters: BM1Parameters, rows: int, zeros: float, typical: float
 ) -> NDArray[np.uint16]:
-    """Return random codes, uint16[rows, lines]; often lines are equal, so that several overflow at once."""
+    """Return random codes, uint16[rows, lines]. Often several lines are equal and their counters overflow together."""
     ones = parameters.ones_code
     shape = (rows, parameters.lines)
     spread = random.uniform(max(2 * typical - 1, 0), min(2 * typical, 1.1), shape)

@@ -111,7 +111,7 @@ class PendingGoals(_Pending):
         return identity
 
     def cancel(self, goal: str) -> None:
-        """Ask the server to cancel a goal, unless it has ended. The status of its `GoalEnded` shows the outcome."""
+        """Ask the server to cancel a goal, or do nothing if the goal has ended. `GoalEnded` shows the outcome."""
         action = self._names.get(goal)
         if action is not None:
             self._wire.write(op="cancel_action_goal", id=goal, action=action)
@@ -271,7 +271,7 @@ class ServedActions(_Served):
         return ros2_type(type_name, "action")
 
     def feed_back(self, goal: str, values: Mapping[str, Any]) -> None:
-        """Send feedback on a goal, unless it has ended."""
+        """Send feedback on a goal, or do nothing if the goal has ended."""
         action = self._goals.get(goal)
         if action is not None:
             self._wire.write(op="action_feedback", id=goal, action=action, values=values)

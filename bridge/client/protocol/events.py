@@ -49,7 +49,10 @@ class MessageReceived(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MessageDiscarded:
-    """A message above its topic's limit: its size, the limit, and the number of such messages so far."""
+    """A message discarded because its size exceeds its topic's limit.
+
+    `count` is the number of messages of this topic that have been discarded so far.
+    """
 
     topic: str
     size: int
