@@ -144,10 +144,10 @@ def is_served(path: str) -> bool:
 
 
 def connect(endpoint: Endpoint, *, timeout: float) -> socket.socket:
-    """Connect to a board, and retry for `timeout` seconds until it listens.
+    """Connect to a board. If the board does not listen yet, try again for `timeout` seconds.
 
     Raises:
-        LinkUnreachableError: Nothing listens there.
+        LinkUnreachableError: No board listens at the endpoint.
         LinkTimeoutError: The host of a TCP endpoint does not answer.
     """
     deadline = time.monotonic() + timeout

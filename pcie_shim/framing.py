@@ -196,7 +196,7 @@ def encode_error(sequence: int, address: int, code: int, detail: str) -> bytes:
 
 
 def decode_error(frame: Frame) -> tuple[int, str]:
-    """Return the code and the sentence of an ERROR frame; a FramingError if it has no code."""
+    """Return the code and the sentence of an ERROR frame, or raise a FramingError if the frame has no code."""
     if frame.words < 1:
         raise FramingError("an ERROR without a code came")
     (code,) = _CRC.unpack_from(frame.payload)

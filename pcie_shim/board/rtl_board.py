@@ -192,7 +192,7 @@ class RtlBoard:
     # ---- the machine ----------------------------------------------------------------------------------
 
     def step(self) -> None:
-        """Run the machine for one more chunk of about 50 ms; then `running` tells whether it must continue."""
+        """Run the machine for one more chunk of about 50 ms. Then `running` tells whether to call `step` again."""
         if self._simulation is None or not self.running:
             return
         began = time.monotonic()
@@ -226,7 +226,7 @@ class RtlBoard:
 
 
 class _Preparation(threading.Thread):
-    """The compilation and start of an image's hardware, in a thread; it ends with a simulation or an error."""
+    """A thread that compiles and starts the hardware of an image. It ends with a simulation or an error."""
 
     def __init__(self, simulate: Callable[[Image], Simulation], image: Image) -> None:
         super().__init__(daemon=True, name="compilation")

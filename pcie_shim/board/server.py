@@ -261,7 +261,10 @@ class BoardServer:
         self._epoll.register(host.socket.fileno(), _READABLE)
 
     def _is_held(self) -> bool:
-        """Return whether a host holds the board; if its host has disconnected, first handle the frames that it sent."""
+        """Return whether a host holds the board.
+
+        If that host has disconnected, first handle the frames that it sent before, and release the board.
+        """
         host = self._host
         # the end of its connection may have arrived, and not been handled yet
         if host is not None and _has_left(host, self._access):
@@ -353,7 +356,10 @@ class BoardServer:
             self._drop_loader(loader)
 
     def _program(self, loader: LoaderConnection, frame: Frame) -> None:
-        """Handle a frame of a loader; after its first request, no other loader may program the board."""
+        """Handle a frame of a loader.
+
+        From a loader's first request until its connection ends, other loaders are refused.
+        """
         if loader is not self._loader:
             if self._loader is not None:
                 raise RefusedError(ErrorCode.HELD, _PROGRAMMED)

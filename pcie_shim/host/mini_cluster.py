@@ -92,7 +92,7 @@ class _Progress:
 
 
 class MiniCluster:
-    """All boards of a deployment, in the order of their partition; used by one thread."""
+    """All boards of a deployment, in the order of the partition. Only one thread may use a MiniCluster."""
 
     def __init__(self, boards: Sequence[DrivenBoard], *, timeout: float, slack: float) -> None:
         """Store the boards; use `open`, which also connects."""

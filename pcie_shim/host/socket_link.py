@@ -251,7 +251,10 @@ class SocketLink:
     # ---- for a host that drives many boards -----------------------------------------------------------
 
     def ask(self, blocks: Iterable[tuple[int, int]]) -> None:
-        """Request blocks, each an address and a number of words, without waiting; `answers` returns them."""
+        """Request blocks of words without waiting; `answers` returns the words.
+
+        A block is an address and a number of words.
+        """
         requests = []
         for address, count in blocks:
             self._sequence = (self._sequence + 1) & ALL_ONES

@@ -68,7 +68,7 @@ class Bare(asyncio.Protocol):
 
 
 async def soon(awaited: Awaitable[Result], what: str) -> Result:
-    """Wait for an awaitable; raise a StackError if it does not complete within `LIMIT` seconds."""
+    """Wait for an awaitable, or raise a StackError if the awaitable does not complete within `LIMIT` seconds."""
     try:
         async with asyncio.timeout(LIMIT):
             return await awaited

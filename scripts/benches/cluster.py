@@ -57,7 +57,7 @@ LEAN: Final = {
 
 
 class Designs:
-    """A sweep over some machines for the boat; the file of its results must not exist yet."""
+    """A sweep over some machines for the boat. The sweep's file of results must not exist yet."""
 
     def __init__(self, folder: Path, designs: int, frames: int) -> None:
         model, device = boat().model(), device_named("proce-v-d8")

@@ -169,7 +169,7 @@ def read(url: str) -> None:
 
 
 async def cycles(plain: Stand, beside: Stand, frames: int, seed: int) -> Rows:
-    """Compare the cycle times of two stacks, measured in short turns; only `beside` runs a dashboard and its reader."""
+    """Compare the cycle times of two stacks in short turns. Only `beside` has a dashboard, which a client reads."""
     async with connect(plain.uri) as one, connect(beside.uri) as other:
         # a process of its own, as a browser is
         reader = multiprocessing.get_context("spawn").Process(target=read, args=(beside.url,), daemon=True)

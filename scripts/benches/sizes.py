@@ -45,7 +45,7 @@ PARTS = {
 
 
 class Point(NamedTuple):
-    """Measurements of one problem: medians over its frames; of times, the 10th percentiles."""
+    """Measurements of one problem: medians over the problem's frames, but 10th percentiles for times."""
 
     lines: int
     sensors: int

@@ -19,7 +19,10 @@ TOPICS: Final = ("/bm/counts", "/bm/posterior", "/bm/pose", "/bm/decision", "/di
 
 
 async def measure(some: list[dict[str, int]]) -> float:
-    """Print the median cycle times with topics for robot tools, which a client reads, and without; return the ratio."""
+    """Print the median cycle times with and without the topics for robot tools, and return their ratio.
+
+    A client reads the topics.
+    """
     async with contextlib.AsyncExitStack() as stack:
         sides = []
         for extra in ("", OFF):

@@ -139,7 +139,10 @@ class Stack:
         return [*master, *(["--fused"] if self._topology.fused else []), *boards]
 
     async def start_part(self, role: str, misbehave: str = "") -> None:
-        """Start a process of the campaign; raise a NotThereError if it is a server and does not become ready."""
+        """Start a process of the campaign.
+
+        Raises a NotThereError if the hub or a board does not become ready.
+        """
         self._starts += 1
         process = Process(role, self._folder / f"{self._starts:03}-{role}.log")
         command = self._command(role, misbehave)
@@ -237,7 +240,10 @@ class Stack:
 
 
 def used_by(pid: int) -> tuple[int, int, int]:
-    """Return a process's bytes of address space, KiB in memory, and descriptors; raise an OSError if it has ended."""
+    """Return the bytes of a process's address space, its KiB in memory, and its number of descriptors.
+
+    Raises an OSError if the process has ended.
+    """
     pages = Path(f"/proc/{pid}/statm").read_text().split()
     size, resident = (int(each) * os.sysconf("SC_PAGE_SIZE") for each in pages[:2])
     return size, resident // 1024, len(list(Path(f"/proc/{pid}/fd").iterdir()))

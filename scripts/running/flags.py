@@ -26,7 +26,7 @@ class ScriptParser(argparse.ArgumentParser):
         super().__init__(prog, description=description.splitlines()[0])
 
     def add_argument(self, *names: str, shown: str = "", **options: Any) -> argparse.Action:
-        """Add a flag or an argument as argparse does; the help shows `shown` as the default if the code computes it."""
+        """Add a flag or an argument as argparse does. If `shown` is given, the help shows this text as the default."""
         if options.get("action", "append") == "append" and names[0].startswith("-"):
             kind = "|".join(options.get("choices", ())) or _KINDS.get(options.get("type"), "TEXT")
             options.setdefault("metavar", kind)

@@ -43,7 +43,10 @@ class Tally:
     def check(
         self, name: str, *errors: type[Exception], details: Callable[[], str] = lambda: ""
     ) -> Iterator[None]:
-        """Run the block as a check and report it; a CheckError or one of `errors` fails it, and adds `details`."""
+        """Run the block as a check, and report the result.
+
+        The check fails if the block raises a CheckError or one of `errors`. Then the report also has the text of `details`.
+        """
         started, why = time.monotonic(), None
         known: tuple[type[Exception], ...] = (CheckError, *errors)
         try:

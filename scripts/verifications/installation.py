@@ -25,7 +25,7 @@ PINNED: Final = ("--no-deps", "--require-hashes", "--only-binary", ":all:")
 
 
 def run(*command: str | Path, cwd: Path | None = None) -> None:
-    """Run an installer; raise a SettingsError if it fails or does not end in time."""
+    """Run an installer. Raises a SettingsError if the installer fails or does not end in time."""
     shown = " ".join(Path(word).name for word in command[:4])
     try:
         subprocess.run(command, cwd=cwd, check=True, capture_output=True, text=True, timeout=LIMIT)
@@ -60,9 +60,9 @@ def cached(name: str, locks: tuple[Path, ...], make: Callable[[Path], None]) -> 
 
 
 def use_packages(name: str, lock: Path) -> Path:
-    """Make the packages of a lock file importable, from a folder of their own, which is returned.
+    """Make the packages of a lock file importable, and return the folder that contains only these packages.
 
-    They are installed once, without their dependencies.
+    The packages are installed at the first call, without their dependencies.
     """
 
     def make(folder: Path) -> None:

@@ -40,7 +40,10 @@ _SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_UP = 0x8913, 0x8914, 0x1
 
 
 def install() -> Path:
-    """Return the server's folder (bin, lib), after installing it if it is missing; raise a SettingsError on failure."""
+    """Install the server if it is missing, and return the server's folder, which contains `bin` and `lib`.
+
+    Raises a SettingsError if the installation fails.
+    """
     kind, version = platform.libc_ver()
     here = (sys.platform, platform.machine(), kind)
     if here != ("linux", "x86_64", "glibc") or tuple(map(int, version.split(".")[:2])) < GLIBC:

@@ -38,7 +38,7 @@ async def receive(ros: Ros, heard: dict[int, tuple[int, ...]]) -> None:
 
 
 def differences(instance: Instance, addresses: tuple[int, ...]) -> str:
-    """Return how a result differs from that of the reference kernel, as a clause; empty if it does not."""
+    """Compare a result with the reference kernel. Return a clause with the first difference, or an empty text."""
     deployment = load_deployment(Path(os.environ["BM_DEPLOYMENT"]))
     report, posterior, machine = instance.report, instance.posterior, deployment.machine
     assert report is not None

@@ -67,7 +67,10 @@ class Stack:
         codes: Collection[int] = (0,),
         streams: str = "output",
     ) -> str:
-        """Run docker and return its output; raise a CheckError if its exit code is not in `codes`, or after `limit`."""
+        """Run docker and return its output.
+
+        Raises a CheckError if docker's exit code is not in `codes`, or if docker runs longer than `limit` seconds.
+        """
         what = f"docker {' '.join(arguments[:3])}"
         with (OUT / "docker.log").open("a") as log:
             log.write(f"--- {datetime.now(UTC):%H:%M:%S} docker {' '.join(arguments)}\n")
