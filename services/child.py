@@ -69,7 +69,10 @@ class _Pipe:
         asyncio.get_running_loop().add_reader(self._reader, self.read)
 
     def read(self, *, last: bool = False) -> None:
-        """Read what has arrived; with `last`, also pass on a final line without a line end."""
+        """Read the child's output, at most 64 KiB, and pass on the lines.
+
+        With `last`, read all of the output, and also pass on a final line without a line end.
+        """
         while self._is_open:
             try:
                 data = os.read(self._reader, 1 << 16)

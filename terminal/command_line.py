@@ -94,7 +94,7 @@ class _Command(TyperCommand):
 
 
 class _Later(_Command):
-    """A placeholder with the name and purpose of a subcommand; its callback imports and returns the subcommand."""
+    """A placeholder with the name and purpose of a subcommand. Its callback imports and returns the real command."""
 
 
 class _Group(TyperGroup):

@@ -105,7 +105,10 @@ def discard_output() -> None:
 
 
 def check_writable(folder: Path) -> None:
-    """Create a folder if necessary, and check before a long run that it can be written to; an OutputError if not."""
+    """Create a folder if necessary, and check before a long run that files can be written there.
+
+    Raises an OutputError if the folder cannot be created or written to.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):

@@ -5,7 +5,7 @@ from typing import ClassVar
 
 
 class ToolchainError(Exception):
-    """Base class of the toolchain's errors; `str()` is one sentence that says what to do."""
+    """Base class of the toolchain's errors. The text of an error is one sentence that tells the user what to do."""
 
     exit_code: ClassVar[int] = 2
 

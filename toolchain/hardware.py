@@ -135,7 +135,7 @@ def board_memories(image: Image) -> list[Memory]:
 
 
 def _deployment(image: Image) -> Deployment:
-    """Return a deployment for an image; its variables have numbers as names, because an image has no names."""
+    """Return a deployment for an image. An image has no names, so the names of the variables are numbers."""
     parameters = image.machine.parameters
     widths = [*parameters.sensor_bits, *([parameters.prior_bits] if parameters.prior_bits else [])]
     total = image.partition.total_lines

@@ -18,7 +18,7 @@ _encoder = msgspec.msgpack.Encoder()
 _decoder = msgspec.msgpack.Decoder(list[BoardResult])
 
 PriorRow = int | tuple[int, ...]
-"""Number of a row in the prior's table; with replicas, one such number for each."""
+"""Number of a row in the prior's table. With replicas, a tuple with a row number for each replica."""
 
 
 class BoardAwayError(BoardError):

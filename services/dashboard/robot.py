@@ -234,7 +234,7 @@ class WatchedRobot:
             await asyncio.sleep(_STATUS_EVERY)
 
     async def _learn_axes(self, folder: Path) -> None:
-        """Read the units from the deployment folder of the master on this host; without it, cells are only indices."""
+        """Read the units from the master's deployment folder on this host. Without units, cells are only indices."""
         try:
             deployment = await asyncio.to_thread(load_deployment, folder, images=False)
         except (ToolchainError, OSError) as error:
@@ -244,7 +244,10 @@ class WatchedRobot:
         self._feed.changed()
 
     def axes_for(self, frame: KeptFrame) -> tuple[Axis, ...]:
-        """Return the axes of a frame's posterior; none for a frame of another deployment, whose units may differ."""
+        """Return the axes of a frame's posterior, or no axes if the frame is from another deployment.
+
+        The units of another deployment may differ.
+        """
         if self._deployment_of(frame) is None or frame.values is None:
             return ()
         ours = [(axis.label, axis.size) for axis in self._axes]

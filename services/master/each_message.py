@@ -38,7 +38,10 @@ class EachMessagePeers(Peers):
 
     @property
     def not_ready(self) -> list[str]:
-        """The roles of peers that are not ready; during the run only pcie-app counts, because it alone stays."""
+        """The roles of peers that are not ready.
+
+        During the run only pcie-app counts, because a new subscriber and a new publisher start for each message.
+        """
         return [role for role in super().not_ready if role == self.app.role or not self.begun.is_set()]
 
     @property

@@ -220,7 +220,7 @@ class ResultTopics:
 
 
 def _sent(publication: Publication, message: dict[str, Any]) -> bool:
-    """Send a message if its server accepts it at once; return whether it was sent."""
+    """Send a message if the server accepts the message at once. Return whether it was sent."""
     try:
         publication.publish_nowait(message)
     except (DisconnectedError, SlowPeerError):

@@ -173,7 +173,7 @@ def check_metrics(metrics: str, *, insecure: bool) -> None:
 
 
 def shifted(metrics: str, ports: int) -> str:
-    """Return the address `metrics` with `ports` added to its port, for another process of the run; empty if it is."""
+    """Return `metrics` with `ports` added to its port, for another process of the run. An empty address stays empty."""
     if not metrics:
         return ""
     endpoint = metrics_endpoint(metrics)

@@ -227,7 +227,7 @@ async def read_process_status(path: str, timeout: float) -> ProcessStatus:
 
 
 def _connected(asking: socket.socket, path: str) -> bool:
-    """Try to connect; return False if the backlog is full, so that the caller can retry without blocking."""
+    """Try to connect without blocking. Return False if the server's backlog is full; the caller can then try again."""
     try:
         asking.connect(path)
     except BlockingIOError:

@@ -121,7 +121,10 @@ class EmulatedBoards:
     def run_for(
         self, addresses: Inputs, prior_address: int, bank: int, cycles: int, prior: WrittenPrior = None
     ) -> FrameRun:
-        """Run each board for `cycles` cycles, whatever its counts; boards on which no line can count do not run."""
+        """Run each board for `cycles` cycles; counts do not stop a board.
+
+        A board does not run if each of its lines has a code 0.
+        """
         start = Start(
             addresses=(),
             prior_address=prior_address,

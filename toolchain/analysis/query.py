@@ -140,7 +140,7 @@ def answer(
 def _machine_answer(
     question: Question, addresses: tuple[int, ...], exact: NDArray[np.float64], choice: MachineChoice
 ) -> MachineAnswer:
-    """Run, in this process, the machine that a build would make; `addresses` are those of the known states."""
+    """Run the machine that a build would make, in this process. `addresses` are the addresses of the known states."""
     options = BuildOptions(machine=choice)
     model, why = model_for(question, options)
     if isinstance(model, NetworkModel):

@@ -42,7 +42,7 @@ class BM2Plan:
     model: NetworkModel
     options: BuildOptions
     parameters: BM2Parameters
-    """The parameters of the first board; those of other boards differ only in `chain`, the board's index."""
+    """The parameters of the first board. Other boards differ only in `chain`, the index of the board."""
     target_count: int
     """The number of samples of each board."""
     max_cycles: int

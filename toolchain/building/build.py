@@ -130,7 +130,10 @@ def assemble(
     plan: MachinePlan | BM2Plan,
     place: Callable[[Deployment, Sequence[Image]], Deployment] = lambda deployment, _: deployment,
 ) -> Built:
-    """Return a deployment without writing anything, or raise a BuildError; `place` may change its topics."""
+    """Return a deployment without writing a file. The function `place` may change the deployment's topics.
+
+    Raises a BuildError if the deployment cannot be made.
+    """
     model, options, quantised = plan.model, plan.options, None
     known_variables(plan)  # refuses --order and --path before the tables are computed
     machines: Sequence[BM1Machine | BM2Machine]

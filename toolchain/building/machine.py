@@ -185,7 +185,10 @@ def partition_lines(lines: int, count: int) -> tuple[LineBlock, ...]:
 
 
 def split(machine: BM1Machine, count: int) -> tuple[BM1Machine, ...]:
-    """Divide a machine among `count` boards, and return each board's machine; errors are those of `partition_lines`."""
+    """Divide a machine among `count` boards, and return each board's machine.
+
+    Raises a BuildError if the machine has fewer than `count` lines.
+    """
     return tuple(
         BM1Machine(
             replace(machine.parameters, lines=block.lines),

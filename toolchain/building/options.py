@@ -293,7 +293,7 @@ class BuildOptions(MachineOptions, TargetOptions):
 
     @property
     def written_prior(self) -> WrittenPrior | None:
-        """The source and the path of the prior that the host writes; None if it writes none."""
+        """The source and the path of the prior that the host writes, or None if the host writes no prior."""
         if self.sources is not None:
             return self.sources.prior
         return None if self.prior_path is None else WrittenPrior(path=self.prior_path)

@@ -46,7 +46,7 @@ class SourcesFile:
 
     @property
     def prior(self) -> WrittenPrior | None:
-        """The source and the path of the prior that the host writes; None if it writes none."""
+        """The source and the path of the prior that the host writes, or None if the host writes no prior."""
         paths = [(at, table.prior) for at, table in enumerate(self.tables) if table.prior is not None]
         return WrittenPrior(source=paths[0][0], path=paths[0][1]) if paths else None
 

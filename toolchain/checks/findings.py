@@ -111,7 +111,10 @@ class CheckedMachine:
         return ["the prior", *(variable.name for variable in self.deployment.sensors)]
 
     def addressable_rows(self, column: int) -> NDArray[np.uint16]:
-        """Return the rows of a sensor's table that readings can select; if readings may be missing, also their row."""
+        """Return the rows of a sensor's table that readings can select.
+
+        If readings may be missing, the last row is the row for missing readings.
+        """
         return _addressable(self.deployment.sensors[column], self.tables[column])
 
     def prior_rows(self) -> NDArray[np.uint16]:

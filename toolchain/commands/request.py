@@ -67,7 +67,7 @@ class ModelFlags:
         return ModelFlags(**found)
 
     def section(self, bits: Iterable[str] = ()) -> ModelSection:
-        """Return the flags as `[model]` of a deployment keeps them; `bits` has the values of `--bits`."""
+        """Return the flags as the section `[model]` of a deployment. `bits` has the values of the flag `--bits`."""
         flags = {each.name: getattr(self, each.name) for each in fields(ModelFlags)}
         lists = {"settings": self.settings or (), "given": self.given or (), "bits": bits}
         return ModelSection(**flags | {key: tuple(values) for key, values in lists.items()})

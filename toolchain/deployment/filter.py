@@ -29,7 +29,10 @@ _HEADER_BYTES: Final = 4096
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Transition:
-    """P(S) before the first frame, and its change from frame to frame; a ModelError if one does not sum to 1."""
+    """P(S) before the first frame, and the change of S from frame to frame.
+
+    Raises a ModelError if a distribution has a negative number or does not sum to 1, or if the shapes do not match.
+    """
 
     start: NDArray[np.float64]
     """P(S) before the first frame, float64[lines]."""

@@ -38,7 +38,7 @@ def run_fit(
     options: FitOptions,
     checks: Sequence[Path] = (),
 ) -> str:
-    """Learn the tables of a model, write them, and return a report; `checks` are recordings that only test the fit."""
+    """Learn the tables of a model, write them, and return a report. The recordings in `checks` only test the fit."""
     _check(options, output)
     for path in checks:
         if any(path.resolve() == other.resolve() for other in recordings):
@@ -140,7 +140,10 @@ def _comparison(
 def _posteriors(
     model: Model, truth: TrueCells, readings: Mapping[str, Sequence[object]]
 ) -> list[NDArray[np.float64] | None]:
-    """Return the exact posterior of each row with a true position; None if its readings are impossible in the model."""
+    """Return the exact posterior of each row with a true position.
+
+    The posterior is None if the row's readings are impossible in the model.
+    """
     found: list[NDArray[np.float64] | None] = []
     for row in truth.rows.tolist():
         try:

@@ -160,7 +160,7 @@ Type: TypeAlias = IntegerType | IntervalType | LabelType
 
 @dataclass(frozen=True, slots=True)
 class Symbol:
-    """A variable: its name, its type, and, for a known variable, where its readings come from."""
+    """A variable with its name and type. For a known variable, `path` is the place of its readings in the message."""
 
     name: str
     """Name of the symbol, and of its field in the message unless `path` is given."""
@@ -404,7 +404,7 @@ def function(symbol: Symbol, given: Sequence[Symbol], value: Formula) -> Distrib
 
 
 def potential(symbols: Sequence[Symbol], values: ArrayLike) -> Potential:
-    """Return a factor that is not a distribution itself, as in a Markov network.
+    """Return a factor that need not be a distribution, as the factors of a Markov network.
 
     `values` are float64[size of each symbol], each at least 0.
 

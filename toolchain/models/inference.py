@@ -56,7 +56,10 @@ def reduced(term: Term, values: Mapping[str, int]) -> Term:
 
 
 def product(terms: Sequence[Term], scope: Sequence[str], sizes: Mapping[str, int]) -> NDArray[np.float64]:
-    """Return the product of terms, float64[size of each symbol in `scope`]; a ModelError if it is too large."""
+    """Return the product of terms, float64[size of each symbol in `scope`].
+
+    Raises a ModelError if the product is too large.
+    """
     _check_size(scope, sizes, "the answer")
     if len(terms) == 1 and terms[0].scope == tuple(scope):  # not copied: it may be large
         return terms[0].table
@@ -98,7 +101,7 @@ def eliminate(terms: Iterable[Term], names: Iterable[str], sizes: Mapping[str, i
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """An order of elimination; it is incomplete if its largest table, with `largest` entries, exceeds the limit."""
+    """An order of elimination. Its largest table has `largest` entries; above the limit, the order is incomplete."""
 
     order: tuple[str, ...]
     entries: int

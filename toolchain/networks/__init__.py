@@ -27,7 +27,7 @@ _READERS: Final = {
     ".net": "text_formats.read_net",
     ".xdsl": "xml_formats.read_xdsl",
 }
-"""The reader of each suffix; it is imported when it is needed, because it needs NumPy."""
+"""For each suffix, the module and the function that read the file. Modules are imported late: they need NumPy."""
 SUFFIXES: Final = tuple(_READERS)
 """Suffixes of network files; `.gz` may follow."""
 
@@ -73,7 +73,7 @@ def _suffix(path: Path) -> str:
 
 
 def _unpacked(path: Path, data: bytes) -> bytes:
-    """Return the content of a compressed file; a NetworkFileError if it is damaged or too large."""
+    """Return the content of a compressed file, or raise a NetworkFileError if the file is damaged or too large."""
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
             content = file.read(MAX_BYTES + 1)

@@ -84,7 +84,7 @@ def parse_mif(text: str, name: str = "the MIF", due: tuple[int, int] | None = No
 
 
 class _Reader:
-    """A reader of a MIF's tokens; `_kind` and `_word` are the current token, and `_line` is its line."""
+    """A reader of a MIF's tokens. `_kind` and `_word` describe the current token, and `_line` is the token's line."""
 
     def __init__(self, text: str, name: str, due: tuple[int, int] | None) -> None:
         self._name = name
