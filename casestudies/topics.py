@@ -39,7 +39,10 @@ class Readiness:
     """Readiness of a process, which is ready if it has worked within the last `RECENT_S` seconds."""
 
     def __init__(self, work: str) -> None:
-        """Start with no work done; `work` describes the work in the past tense, such as "a reading was published"."""
+        """Start with no work done.
+
+        `work` describes a step of the work in the past tense, for example "a reading was published".
+        """
         self._work = work
         self._last: float | None = None
         self._done = 0

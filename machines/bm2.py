@@ -228,7 +228,10 @@ class BM2Parameters:
 
     @property
     def joint_words(self) -> int:
-        """Words of the searched variables' joint histogram; 0 if it does not fit after the other histograms."""
+        """Number of words of the joint histogram of the searched variables.
+
+        If the joint histogram does not fit in the results after the other histograms, the number is 0.
+        """
         words = 1 << sum(self.bits[variable] for variable in self.searched) if self.searched else 0
         return words if self.histogram_words + words <= RESULT_WORDS_MAX else 0
 

@@ -111,7 +111,10 @@ class Chains:
         return tuple(results)
 
     def _run_together(self, starts: Sequence[BM2Start]) -> list[ChainResult] | None:
-        """Run the chains sliced or in step; return None if they allow neither, or if one may not draw all samples."""
+        """Run the chains together, sliced or in step. Return the results, or None if the chains must run one by one.
+
+        The chains must run one by one if the machine allows neither way, or if a chain may not draw all samples.
+        """
         parameters, first, count = self._parameters, starts[0], len(starts)
         if (
             count < IN_STEP

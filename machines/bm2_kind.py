@@ -219,7 +219,10 @@ def _settings_blocks(parameters: BM2Parameters) -> Blocks:
 def _start_of(
     parameters: BM2Parameters, blocks: Mapping[str, bytes | memoryview], settings: FrameSettings
 ) -> BM2Start:
-    """Return the start that a host has written to a board's blocks; words after those of the state are ignored."""
+    """Return the start that a host has written to a board's register blocks.
+
+    If a block has more words than the state of the machine, the words after the state's words are ignored.
+    """
 
     def value(block: str) -> int:
         # a frame without a start state has no words for it

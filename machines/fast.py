@@ -164,7 +164,10 @@ class FastBM1(BM1Kernel):
         self._take_outcome()
 
     def _take_outcome(self) -> None:
-        """Set cycles and reasons from the frame's outcome; halted replicas keep their previous cycles and reasons."""
+        """Set the cycles and the stop reasons of the replicas from the frame's outcome.
+
+        A halted replica keeps the cycles and the stop reason from before it was halted.
+        """
         for replica, (live, _, cycles, overflow) in enumerate(self._frame.outcome.tolist()):
             self._cycles[replica] = cycles
             if live == 0:

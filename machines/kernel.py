@@ -108,11 +108,11 @@ class BM1Kernel(ABC):
 
     @abstractmethod
     def _start(self, start: Start) -> None:
-        """Run the first slice of a start that was checked; set cycles and reasons."""
+        """Run the first slice of a checked start. Set the cycles and stop reasons of the replicas."""
 
     @abstractmethod
     def _resume(self, going: list[int], run_until: int) -> None:
-        """Run the next slice of the replicas with the indices `going`; set their cycles and reasons."""
+        """Run the next slice of the replicas with the indices `going`. Set their cycles and stop reasons."""
 
     def _check_resume(self, run_until: int, halted: Collection[int], halts: Collection[int]) -> None:
         replicas = len(self._reasons)

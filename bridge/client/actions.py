@@ -110,12 +110,14 @@ class Goal:
         self._session.flush()
 
     async def result(self, timeout: float) -> GoalResult:
-        """Wait until the goal has ended, also if canceled or aborted, and return its result. May be called again.
+        """Wait until the goal has ended, and return the result. The method may be called again.
+
+        A canceled or aborted goal also has a result.
 
         Raises:
             GoalError: The action refused the goal, or does not exist.
-            NoAnswerError: The goal did not end in time, and is still active.
-            DisconnectedError: The connection was lost before it ended.
+            NoAnswerError: The goal did not end within `timeout` seconds, and is still active.
+            DisconnectedError: The connection was lost before the goal ended.
         """
         try:
             async with asyncio.timeout(timeout):

@@ -381,7 +381,10 @@ class Ros:
         return self.ros_version
 
     async def topic_type(self, topic: str, timeout: float = 1.0) -> str | None:
-        """Return the type of a topic at the server: empty if it does not know the topic, None without rosapi."""
+        """Return the type of a topic at the server, or None if the server has no rosapi.
+
+        If the server does not know the topic, the type is empty.
+        """
         return await self._ask_type(timeout, "topic_type", topic=topic)
 
     async def topics(self, timeout: float = 1.0) -> list[str] | None:
@@ -405,7 +408,10 @@ class Ros:
         return await self._ask_names(timeout, "services")
 
     async def service_type(self, service: str, timeout: float = 1.0) -> str | None:
-        """Return the type of a service: empty if the server does not know it, None without rosapi."""
+        """Return the type of a service, or None if the server has no rosapi.
+
+        If the server does not know the service, the type is empty.
+        """
         return await self._ask_type(timeout, "service_type", service=service)
 
     async def _ask_type(self, limit: float, question: str, **args: str) -> str | None:

@@ -138,7 +138,10 @@ def _scalar(value: Any, element: str, place: str) -> Any:
 
 
 def _numbers(values: Any, element: str, length: int, place: str) -> list[Any] | bytes:
-    """Return an array's numbers, after checking their types and range and, unless `length` is 0, how many they are."""
+    """Check the types, the range and the number of an array's values, and return the values.
+
+    If `length` is 0, the array may have any number of values.
+    """
     if element == "float64" and not length:
         try:  # much faster than comparing types, it refuses the same ones
             return msgspec.convert(values, list[float])

@@ -1,8 +1,8 @@
-"""State of the hub: its clients, topics, services and actions.
+"""State of the hub: the clients, topics, services and actions.
 
-The graph keeps its parts consistent; handlers decide which operations are allowed. Topics, services and
-actions are stored under their absolute names. A client may omit the leading slash, and receives messages
-under the name that it used.
+The graph keeps the state consistent. Handlers decide which operations are allowed. Topics, services and
+actions are stored under their absolute names. A client may omit the leading slash of a name. Messages to
+this client then also have the name without the slash.
 """
 
 from collections.abc import Mapping

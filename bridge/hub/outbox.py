@@ -187,7 +187,7 @@ class Outbox:
         return None
 
     def accepts(self, lane: Lane, now: float) -> bool:
-        """Return whether `offer` would keep a message now, so that it is worth encoding."""
+        """Return whether `offer` would keep a message now. Otherwise the caller need not encode the message."""
         return not lane.throttle or bool(lane.queue_length) or (now >= lane.next_time and not lane.held)
 
     def release(self, now: float) -> None:

@@ -280,7 +280,10 @@ class WebSocketTransport(asyncio.Protocol):
     # Reading
 
     def _read_handshake(self, data: bytes) -> None:
-        """Pass the headers of an HTTP message to the library; frames or a body follow them."""
+        """Pass the headers of an HTTP message to the library, and handle the data after the headers.
+
+        This data is WebSocket frames or the body of the message.
+        """
         self.first_bytes = (self.first_bytes + data)[:_FIRST_BYTES]
         before = self._handshake_tail
         end = (before + data).find(_END_OF_HEADERS)
@@ -315,7 +318,7 @@ class WebSocketTransport(asyncio.Protocol):
             self.proceed()
 
     def proceed(self) -> None:
-        """Continue an interrupted turn after other tasks had theirs, unless reading is still blocked."""
+        """If reading is not blocked, continue an interrupted turn as soon as other tasks have had a turn."""
         if self._interrupted is not None and not self._is_scheduled and not self.is_blocked:
             self._is_scheduled = True
             asyncio.get_running_loop().call_soon(self._proceed)
@@ -386,7 +389,10 @@ class WebSocketTransport(asyncio.Protocol):
             self.close_expected()
 
     def _assembled(self, frame: Frame) -> bytes | None:
-        """Return the message that `frame` completes, or None if more frames follow; the library limits its size."""
+        """Return the message that `frame` completes, or None if more frames of the message follow.
+
+        The library limits the size of a message.
+        """
         data = bytes(frame.data)
         if self._fragments is None:
             if frame.fin:

@@ -158,8 +158,9 @@ def far_apart(instances: Iterable[Instance]) -> tuple[Instance, ...]:
 
 
 def draw_positions(path: Path, instances: Sequence[Instance], *, route: Sequence[Truth] = ()) -> None:
-    """Draw figure 4.4: for each instance the true position on the map and, next to it, the posterior over x and y.
+    """Draw figure 4.4 of the thesis.
 
+    For each instance, the figure shows the true position on the map. The posterior over x and y is next to the map.
     The true positions of the whole route are drawn faintly.
 
     Raises:

@@ -95,7 +95,7 @@ uint16 B3
 
 
 class BadNumberError(Exception):
-    """A command to the boat, or its raw readings, has a field without a usable number; `field` is its name."""
+    """A command to the boat, or a message of raw readings, has no usable number in the field named `field`."""
 
     def __init__(self, field: str, value: object, wanted: str = "be a finite number") -> None:
         super().__init__(f"{field} must {wanted}, not {shown(repr(value))}")

@@ -34,7 +34,7 @@ SIGHTINGS_TOPIC: Final = "/mrclam/sightings"
 SIGHTINGS_TYPE: Final = "mrclam_msgs/Sightings"
 MAP_FRAME: Final = "map"
 LANDMARKS: Final = range(6, 21)
-"""The numbers of the 15 landmarks in the data set; its numbers 1 to 5 are the robots."""
+"""The numbers of the 15 landmarks in the data set. The numbers 1 to 5 are robots."""
 
 SIGHTINGS_MSG: Final = (
     "# mrclam_msgs/Sightings: range (m) and absolute bearing (rad, counter-clockwise from +x) of the landmarks "
@@ -183,7 +183,10 @@ async def _take_turn(
     limit_s: float,
     repeat_s: float,
 ) -> Instance | None:
-    """Publish a frame, again every `repeat_s`, until its result arrives; return the result, or None after `limit_s`."""
+    """Publish a frame, and wait for the result. Return the result, or None if it does not arrive in `limit_s` seconds.
+
+    Until the result arrives, the frame is published again every `repeat_s` seconds.
+    """
     stamps: set[int] = set()
     end = time.monotonic() + limit_s
     while (now := time.monotonic()) < end:

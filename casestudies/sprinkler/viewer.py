@@ -165,7 +165,10 @@ class SamplesViewer:
     async def _samples_of(
         self, posterior: Posterior, samples: Subscription, limit_s: float
     ) -> NDArray[np.int64] | None:
-        """Return the samples of the posterior's frame, found by their share of R = 1; None if they are lost."""
+        """Return the samples of the posterior's frame, or None if these samples are lost.
+
+        Samples belong to the frame if the share of R = 1 in the samples equals the posterior of R = 1.
+        """
         share = posterior.marginal("R")[1]
         while True:
             for at, states in enumerate(self._unclaimed):

@@ -66,7 +66,10 @@ class PendingCalls(_Pending):
     """Calls of this client that have no answer yet."""
 
     def send(self, service: str, args: Mapping[str, Any]) -> str:
-        """Call a service, unless `MAX_CALLS` calls are pending; return the id for its `CallAnswered`."""
+        """Call a service, and return the id that the event `CallAnswered` will have.
+
+        Raises a SlowPeerError if `MAX_CALLS` calls are pending.
+        """
         check_name(service)
         if len(self._names) >= MAX_CALLS:
             raise SlowPeerError(f"{MAX_CALLS} service calls are pending, so {service} is not called")
