@@ -2,9 +2,9 @@
 
     frame ──▶ waits until the wire is free ──▶ occupies it for bits / rate ──▶ latency ──▶ arrives
 
-The board's side delays the frames that it receives and those that it sends. This delay is a real wait, in addition to
-the time that the socket takes. The delay changes no counts, and is not in COMPUTE_NS. Programming has its own port,
-which is not delayed.
+The board's process delays the frames that it receives and the frames that it sends. The process really waits, in
+addition to the time that the socket takes. The delay changes no counts, and is not part of COMPUTE_NS. Frames on the
+programming port are not delayed.
 """
 
 import fcntl

@@ -42,12 +42,12 @@ _Word: TypeAlias = Annotated[int, Field(ge=0, lt=2**32)]  # pydantic checks it w
 
 @dataclass(frozen=True)
 class Partition:
-    """The part of a model on one board: its lines from `line_offset` on.
+    """The part of a model on one board: a block of lines.
 
     Attributes:
         index: Number of the board, from 0.
         count: Number of boards.
-        line_offset: First line on the board.
+        line_offset: First line of the model on the board.
         total_lines: Number of lines of the model, on all boards together.
     """
 

@@ -313,7 +313,10 @@ def listen(
 
 @contextlib.contextmanager
 def _loop_in_a_thread() -> Iterator[Callable[[Coroutine[Any, Any, Any]], Any]]:
-    """Run an event loop in its own thread within the context; yield a function that runs a coroutine there."""
+    """Within the context, run an event loop in a thread of its own.
+
+    Yields a function that runs a coroutine in this event loop and returns the coroutine's result.
+    """
     loops: list[asyncio.AbstractEventLoop] = []
 
     @contextlib.asynccontextmanager

@@ -96,10 +96,12 @@ class Posterior:
         )
 
     def with_units(self, deployment: "Deployment | Path | str") -> "Posterior":
-        """Return this posterior with the units and states of a deployment, given as an object or as its folder.
+        """Return this posterior with the units and the names of states of a deployment.
+
+        `deployment` is the deployment or its folder.
 
         Raises:
-            LabelError: The deployment's posteriors have other dimensions.
+            LabelError: The posteriors of the deployment have other dimensions than this posterior.
             ToolchainError: There is no deployment in the folder.
         """
         from toolchain.deployment import Deployment, load_deployment

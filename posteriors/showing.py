@@ -18,7 +18,10 @@ _MOST_BARS: Final = 24
 """Maximum number of cells that are shown as one row each; more are drawn as a picture."""
 _BAR: Final = 24
 _SIDE: Final = 256
-"""Size of a picture in pixels, along its longer side; finer posteriors are drawn in blocks of cells."""
+"""Maximum size of a picture in pixels, along the longer side.
+
+If a posterior has more cells along a side, a pixel shows a block of cells.
+"""
 _MOST_NAMES: Final = 16
 """Maximum number of states that are written along an axis."""
 _LONGEST: Final = 8

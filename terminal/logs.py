@@ -166,7 +166,7 @@ def _quoted(value: object) -> str:
 
 
 def get_logger(role: str, level: str = "info") -> Logger:
-    """Return the logger of a process; its lines contain the name of the process, and the number of the frame if any."""
+    """Return the logger of a process. Each line of the log contains the name `role` of the process."""
     # our own messages already report what libraries warn of; only their errors are new
     log_libraries(logging.ERROR, "%(name)s: %(message)s")
     return Logger(role, level)

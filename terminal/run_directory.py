@@ -41,7 +41,10 @@ def default_run_directory() -> Path:
 
 
 def run_directory(given: Path | None) -> Path:
-    """Return `given`, or without it create this user's directory; raise an OutputError if that is not private."""
+    """Return the run directory `given`. If `given` is None, create and return this user's default run directory.
+
+    Raises an OutputError if the default directory cannot be created, or is not a private directory of this user.
+    """
     if given is not None:
         return given.absolute()
     path = default_run_directory()

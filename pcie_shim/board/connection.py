@@ -175,7 +175,7 @@ class HostConnection(Connection):
 
 
 class LoaderConnection(Connection):
-    """A loader's connection to the programming port; after its first request, it excludes other loaders."""
+    """A loader's connection to the programming port. After this loader's first request, other loaders are refused."""
 
     def __init__(self, connection: socket.socket, key: bytes, greeting: bytes) -> None:
         super().__init__(connection, key, greeting)

@@ -338,7 +338,7 @@ class EmulatedBoard:
             self._run(machine, machine.step, self._chunk_end(machine.cycles, self._max_cycles))
 
     def _run(self, machine: BoardMachine, chunk: Callable[[int], None], end: int) -> None:
-        """Run one chunk, to cycle `end`; then write the results to the registers, where a host may read them."""
+        """Run one chunk of the frame, to cycle `end`. Then write the results to the registers for the host."""
         began = time.perf_counter_ns()
         chunk(end)
         elapsed = time.perf_counter_ns() - began
@@ -392,4 +392,4 @@ _LONG_LOW: Final = frozenset({rm.CYCLES, rm.COMPUTE_NS})
 _DATA: Final = tuple(
     range(block, block + 4 * block.words) for block in rm.BLOCKS.values() if block >= rm.SENSORS
 )
-"""Addresses of the blocks from SENSORS on; a board implements only the words that its image uses."""
+"""Addresses of the register blocks from SENSORS on. A board implements only the words that the image uses."""

@@ -93,7 +93,10 @@ class Board(Protocol):
 
 
 class StopSignal:
-    """Stop request for `serve_board`, from a signal handler or a thread; create it after a fork."""
+    """Stop request for `serve_board`, set by a signal handler or a thread.
+
+    A forked process must create a StopSignal of its own, because forks share the pipe in a StopSignal.
+    """
 
     def __init__(self) -> None:
         # a pipe, because a signal handler may write to it, and epoll wakes up
@@ -278,7 +281,7 @@ class BoardServer:
             self._drop_host(host)
 
     def _access(self, host: HostConnection, frame: Frame) -> None:
-        """Handle a frame of a host; if the board is free, the host holds it from then on."""
+        """Handle a frame of a host. If no host holds the board yet, this host holds the board from now on."""
         operation, flags, sequence, address, count, payload = frame
         board = self.board
         if host is not self._host:

@@ -123,16 +123,23 @@ class MiniCluster:
         slack: float = SLACK_S,
         reprogram: bool = False,
     ) -> Self:
-        """Open all boards: check identity, liveness and image, program blank boards, and reset the machines.
+        """Open all boards.
 
-        The endpoints are in the order of the partition. A board has `timeout` seconds to listen, and for each answer.
-        A frame may take `slack` seconds more than its cycles take at the boards' measured speed. With `reprogram`,
-        boards with another image are programmed, now and whenever they are reopened, instead of being refused.
+        For each board, check the identity, the liveness and the image. Blank boards are programmed, and all machines
+        are reset.
+
+        Args:
+            endpoints: The boards, in the order of the partition.
+            images: The image of each board.
+            timeout: Maximum time in seconds until a board listens, and until a board answers a request.
+            slack: Number of seconds that a frame may take in addition to its cycles at the boards' measured speed.
+            reprogram: If True, program a board that has another image, now and at each `reopen`. If False, refuse
+                the board.
 
         Raises:
             EndpointError: An endpoint is invalid.
             ImageMismatchError: The images are not the parts of one model.
-            BoardError: A board cannot be opened; the boards opened before are closed.
+            BoardError: A board cannot be opened. The boards that are already open are closed.
         """
         places = [parse_endpoint(place) if isinstance(place, str) else place for place in endpoints]
         _check_images(len(places), images)
@@ -278,7 +285,7 @@ class MiniCluster:
         return True
 
     def _next_slice(self, progress: _Progress) -> FrameOutput | None:
-        """Return the frame's result after its last slice; otherwise start the next slice and return None."""
+        """If the last slice of the frame is done, return the result. Otherwise start the next slice and return None."""
         # a board reports its computing time in this slice: the longest one of each slice is added up
         now = time.perf_counter_ns()
         progress.waits_ns += now - progress.clock_ns

@@ -287,7 +287,10 @@ class SocketLink:
         self._send(b"".join(self._posted(framing.WRITE, address, words) for address, words in writes))
 
     def post_part(self, offset: int, part: Octets) -> None:
-        """Send the part of a programming file that begins at `offset`, without waiting; errors as for `post`."""
+        """Send the part of a programming file that begins at `offset`, without waiting for an answer.
+
+        If the board refuses the part, receiving the next answer raises the error.
+        """
         self._send(self._posted(framing.PROGRAM, offset, part))
 
     def _posted(self, operation: int, address: int, words: Octets) -> bytes:

@@ -111,7 +111,11 @@ class Hosts:
 
     @contextmanager
     def serving(self, workers: int, *, namespaces: bool) -> Iterator[str]:
-        """Run a scheduler and workers, and yield its address; with `namespaces`, worker n is at NETWORK.(n + 2)."""
+        """Within the context, run a dask scheduler and workers. Yield the address of the scheduler.
+
+        With `namespaces`, each worker runs in a network namespace of its own. Worker n has the address
+        NETWORK.(n + 2).
+        """
         dask = str(Path(sys.executable).with_name("dask"))
         host, names = "127.0.0.1", [f"rosbayes{at}" for at in range(workers)] if namespaces else []
         try:

@@ -179,7 +179,10 @@ def variation(found: Marginals, exact: Marginals) -> list[float]:
 
 
 def compare(network: Network, arguments: argparse.Namespace) -> tuple[float, float]:
-    """Print a table; return the machine's largest total variation: over each evidence's median bank, and over all."""
+    """Print a table that compares the samplers for all evidences of a network.
+
+    Returns two total variations of the machine: the largest of the median banks, and the largest of all banks.
+    """
     names, sweeps = network.model.names, arguments.sweeps
     zeros = f"{network.zeros} zeros, which limit Gibbs samplers" if network.zeros else "no zeros"
     rows: list[list[str] | None] = []

@@ -41,7 +41,7 @@ PARTS = {
     "registers": ("register_writes", "reads"),
     "boards": ("compute",),
 }
-"""Parts of a frame's time, each with the stages that it sums; boards are emulated."""
+"""Parts of a frame's time. The time of a part is the sum of the listed stages. The boards are emulated."""
 
 
 class Point(NamedTuple):

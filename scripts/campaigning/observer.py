@@ -110,7 +110,7 @@ class Observer:
     # --- called by the campaign ----------------------------------------------------------------
 
     def published(self, stamp: int, addresses: Addresses | None, now: float) -> None:
-        """Record a published reading with its stamp in ns; `addresses` is None for an unusable one."""
+        """Record a published reading with its stamp in ns. If the reading is unusable, `addresses` is None."""
         assert stamp not in self._readings
         crowded = self._previous is not None and not self._previous.arrived
         self._previous = self._readings[stamp] = Reading(self.readings, addresses, now, crowded)

@@ -34,7 +34,7 @@ _ANSWER = 0.1 * FACTOR
 _ANSWER_LIMIT = 10.0 * FACTOR
 """Seconds to wait for a result without a fault, when only one reading is in flight."""
 _RECOVERY_LIMIT = 180.0 * FACTOR
-"""Timeout in seconds for new results after a fault; generous, because it does not judge the stack's speed."""
+"""Timeout in seconds for new results after a fault. The timeout is long, because it is not a test of speed."""
 _CALM_LIMIT = 5.0 * FACTOR
 """Seconds allowed for each result of the frames after a fault, in addition to `_RECOVERY_LIMIT`."""
 _SETTLE_LIMIT = 30.0 * FACTOR

@@ -180,7 +180,10 @@ class Browser:
 
 @contextlib.asynccontextmanager
 async def browser() -> AsyncIterator[Browser]:
-    """Start Chromium, after installing what is missing; raise a SettingsError if that cannot be installed."""
+    """Start Chromium, and close it at the end of the context.
+
+    If Chromium or playwright is missing, install it first. Raises a SettingsError if the installation fails.
+    """
     install_programs({"chromium": "chromium"})
     use_packages("playwright", LOCK)
     from playwright.async_api import async_playwright

@@ -144,7 +144,10 @@ def infer(pyagrum: Any, network: Any, asked: Asked) -> NDArray[np.float64]:
 
 
 def difference(joint: JointDistribution, tables: dict[str, Table], suffix: str) -> float:
-    """Return the maximum difference between our tables and those of pyagrum; infinity if shapes or labels differ."""
+    """Return the maximum difference between a probability in our tables and in pyagrum's tables.
+
+    If the variables, the shapes or the labels differ, the difference is infinity.
+    """
     ours = {each.symbol.name: each for each in joint.factors if isinstance(each, Distribution)}
     number = {name: str(at) if suffix == ".uai" else name for at, name in enumerate(tables)}
     if ours.keys() != set(number.values()):

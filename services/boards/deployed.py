@@ -101,7 +101,7 @@ class DeployedBoards:
 
     @property
     def is_late(self) -> bool:
-        """True if a board of the posted frame exceeded its deadline; `collect` raises an error that names it."""
+        """True if a board exceeded the deadline of the posted frame. `collect` then raises an error with the board."""
         return self._cluster is not None and not self._cluster.seconds_left
 
     def _whole_cluster(self) -> MiniCluster:
@@ -131,7 +131,10 @@ class DeployedBoards:
             self._times_gone[board] += 1
 
     def recover(self) -> list[int]:
-        """Try once to reopen the missing boards; return the numbers of those that are back, or raise a BoardError."""
+        """Try once to reopen each missing board. Return the numbers of the reopened boards.
+
+        Raises a BoardError if a board has another image or key, because only the user can solve this.
+        """
         back: list[int] = []
         if self._cluster is None:
             return back

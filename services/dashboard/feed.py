@@ -74,7 +74,10 @@ class KeptFrame:
             return math.nan
 
     def marginal(self, labels: tuple[str, ...]) -> "NDArray[np.float64]":
-        """Return the marginal of one or two labels, in that order; it sums to 1, over all replicas together."""
+        """Return the marginal over one or two variables, with the axes in the order of `labels`.
+
+        The sum of the marginal is 1. If `labels` contains the replicas, the sum over all replicas together is 1.
+        """
         if self.values is None:
             raise ValueError("a frame without a posterior has no marginal")
         places = [self.labels.index(label) for label in labels]

@@ -12,9 +12,9 @@ from services.output.posterior_file import cell_names, write_archive
 
 
 def same_shape(frames: Sequence[KeptFrame], shown: KeptFrame | None) -> list[KeptFrame]:
-    """Return the frames whose posteriors have the same variables as that of `shown`.
+    """Return the frames whose posteriors have the same variables and sizes as the posterior of `shown`.
 
-    If `shown` has no posterior, the newest one decides.
+    If `shown` has no posterior, the newest frame with a posterior is used instead of `shown`.
     """
     with_posterior = [each for each in frames if each.values is not None]
     if shown is None or shown.values is None:

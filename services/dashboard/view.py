@@ -106,7 +106,10 @@ def packed(head: dict[str, Any], picture: bytes = b"") -> bytes:
 
 
 def default_labels(frame: KeptFrame) -> tuple[str, ...]:
-    """Return the first two searched variables, or the only one; `x` is the second, which is drawn horizontally."""
+    """Return the variables to draw by default: the first two searched variables, or the only searched variable.
+
+    The second variable is drawn horizontally. If one of the two is `x`, it is the second.
+    """
     first = frame.searched[:2]
     return first[::-1] if first[:1] == (_ACROSS,) and len(first) == 2 else first
 

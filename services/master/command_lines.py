@@ -21,7 +21,10 @@ def _metrics(settings: Settings, role: str) -> list[str]:
 
 
 def boards_arguments(boards: int, directory: Path, settings: Settings, *, once: bool) -> list[str]:
-    """Return the arguments of the `board` that runs all emulated boards; with `once` it does not restart them."""
+    """Return the arguments of the `board` process that runs all emulated boards.
+
+    With `once`, the `board` process does not restart a board.
+    """
     restarts = "0" if once else str(RESTARTS)
     return [
         # one process for all of them, which loads the kernels once

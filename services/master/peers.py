@@ -85,7 +85,10 @@ class Peer:
         self.missed = False
 
     def cut(self) -> None:
-        """Kill the process if the master started it, otherwise close the connection; the peer's task restores both."""
+        """If the master started the peer's process, kill the process. Otherwise close the connection.
+
+        The master's task for this peer then restarts the process, or connects again.
+        """
         if self.child is not None:
             self.child.kill()
         elif self.protocol is not None:

@@ -121,7 +121,7 @@ class AdvertisedTopic:
     name: str
     type: str
     key: str = ""
-    """Key in the section `[topics]` of the deployment that switches the topic off; empty if it is always on."""
+    """Key in the deployment's section `[topics]` that switches the topic off. Empty if the topic is always on."""
 
 
 def reported_refusals(topics: Iterable[AdvertisedTopic]) -> dict[str, str]:

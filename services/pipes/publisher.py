@@ -81,7 +81,7 @@ def result_from_line(line: bytes, number: int, machine: MachineSection) -> Publi
 
 
 async def publish_lines(settings: Settings, deployment: Deployment) -> int:
-    """Publish the results of standard input until it ends.
+    """Publish the results that standard input contains, one per line, until the end of the input.
 
     Raises:
         InputLineError: A line is not a result of this deployment.

@@ -36,7 +36,7 @@ def encode_record(record: Record) -> bytes:
 
 
 class RecordSplitter:
-    """Decoder of bytes into records; an incomplete record is stored until the rest has arrived."""
+    """Decoder of bytes into records. The decoder stores an incomplete record until the other bytes have arrived."""
 
     def __init__(self, peer: str) -> None:
         self._peer = peer

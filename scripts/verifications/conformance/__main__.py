@@ -23,7 +23,7 @@ NODE_SCRIPT: Final = Path(__file__).with_name("roslib.mjs")
 LIMIT: Final = 240 * FACTOR
 """Time limit of one suite, in seconds."""
 PORT_OF_THE_SUITES: Final = "9090"
-"""Port in the suites' files; in the copies that run here, it is replaced by the port of the hub."""
+"""Port of the server in the files of the suites. In the copies that run here, the hub's port replaces it."""
 SUITES: Final = {
     "1": (
         *("ros1/test_topic.py", "ros1/test_ros.py", "ros1/test_service.py", "ros1/test_param.py"),
