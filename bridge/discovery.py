@@ -75,10 +75,10 @@ class Robot:
 async def discover(timeout: float = 2.0) -> list[Robot]:
     """Return the rosbridge servers that answer within `timeout` seconds, sorted by name.
 
-    It always waits for the whole time.
+    The function waits for this whole time, even if servers answer earlier.
 
     Raises:
-        DiscoveryError: `zeroconf` is not installed, or there is no network.
+        DiscoveryError: The package `zeroconf` is not installed, or there is no network.
     """
     from_name: dict[str, Robot] = {}
     async with _zeroconf() as zeroconf:

@@ -40,7 +40,7 @@ class OptionError(UsageError):
 
 
 class ConcurrentReadError(UsageError):
-    """Raised when two tasks wait for one subscription, because each message would reach only one of them."""
+    """Raised when two tasks wait for messages of one subscription. Each message would reach only one task."""
 
 
 class WrongThreadError(UsageError):
@@ -48,7 +48,7 @@ class WrongThreadError(UsageError):
 
 
 class ActionlibError(UsageError):
-    """Raised for an action of a ROS 1 server: its actions are topics (actionlib), which this client does not handle."""
+    """Raised when an action of a ROS 1 server is used. This client does not support ROS 1 actions (actionlib)."""
 
 
 class EncodeError(UsageError):

@@ -36,7 +36,7 @@ RECENT_S: Final = 10.0
 
 
 class Readiness:
-    """Readiness of a process, which is ready if it has worked within the last `RECENT_S` seconds."""
+    """Readiness of a process. The process is ready if it has worked within the last `RECENT_S` seconds."""
 
     def __init__(self, work: str) -> None:
         """Start with no work done.
@@ -241,10 +241,12 @@ class Listener:
         return self._heard.announced_only
 
     async def next(self, limit_s: float) -> Instance:
-        """Wait for the next frame, then for a true position that is no older; return both, or the frame alone.
+        """Wait for the next frame, and return the frame with its true position if there is one.
+
+        The true position is the latest one before or at the time of the frame, within the tolerance.
 
         Raises:
-            NoResultError: No frame arrived within the limit, in seconds.
+            NoResultError: No frame arrived within `limit_s` seconds.
             BadResultError: A message was not a result, or not a true pose.
         """
         hearing = asyncio.ensure_future(self._heard.next_frame(limit_s))

@@ -309,7 +309,7 @@ class _Course(FrameCourse):
 
 
 class _OnHost(HostMachine):
-    """The host's encoder, which checks frames against the whole machine and encodes them for each board."""
+    """The host's encoder. It checks a frame against the whole machine, and encodes the frame for each board."""
 
     def __init__(self, machines: Sequence[BM1Machine]) -> None:
         # the boards differ in their lines and priors alone: what is used of the first one's parameters holds for all

@@ -47,7 +47,7 @@ FACTOR_VARIABLES_MAX: Final = 32
 """Maximum number of variables of a factor: its array has an axis for each."""
 
 SEARCH_MAX: Final = 150_000
-"""Maximum work of the search for a start state, in arbitrary units; it takes about a second."""
+"""Maximum work of the search for a start state, in arbitrary units. This work takes about a second."""
 
 
 class BM2StopReason(IntEnum):

@@ -84,7 +84,7 @@ def store_of_codes(occurring: npt.NDArray[np.bool_], slots: int) -> _Store:
 
 
 def store_of_frame(occurring: npt.NDArray[np.bool_], cells: int, slots: int) -> _Store:
-    """Allocate words for the codes of one frame of `cells` cells; each frame assigns its codes to rows anew."""
+    """Allocate words for the codes of one frame of `cells` cells. Every frame assigns codes to rows anew."""
     none = np.zeros(min(int(occurring.sum()), cells), dtype=np.int64)
     return _store(np.full(occurring.shape, NO_ROW, dtype=np.int32), none, none, slots)
 
@@ -269,7 +269,7 @@ def _fill(code: int, inverted: Words, words: Words, row: int) -> None:
 
 @jit
 def _count(words: Words, places: npt.NDArray[np.uint32], line: int, width: int, mask: Words) -> int:
-    """Count a line's ones in a block: the ones in the AND of its rows and the mask."""
+    """Return a line's count in a block: the number of ones in the AND of the line's rows and `mask`."""
     made = load(mask, 0)
     for i in range(width):
         made = made & load(words, places[line, i])
@@ -398,10 +398,10 @@ def begin(
     period: int,
     new_rows: bool,
 ) -> int:
-    """Select the lines of every replica and run its first slice; the result is in `frame.outcome`.
+    """Select the lines of every replica, run the first slice of every replica, and fill in `frame.outcome`.
 
-    Returns the number of assigned rows. All rows are assigned before the first block is run, so that a row
-    has the same meaning in all replicas. A replica in which no line can count runs no cycle.
+    Returns the number of assigned rows. All rows are assigned before the first block is run. A row therefore
+    means the same code in all replicas. A replica in which no line can count runs no cycle.
     """
     rows = _NO_ROWS
     for replica in range(codes.shape[0]):

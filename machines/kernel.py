@@ -132,7 +132,7 @@ class BM1Kernel(ABC):
 
 
 def check_start(parameters: BM1Parameters, start: Start) -> None:
-    """Raise a StartError, which names the value and its range, if a start does not fit the machine."""
+    """Raise a StartError if a start does not fit the machine. The error names the wrong value and the valid range."""
     if not _are_plain_addresses(parameters, start.addresses):
         _check_inputs(parameters, start.addresses)
     if isinstance(start.prior_address, tuple):

@@ -45,7 +45,10 @@ def board_proof(key: bytes, board_nonce: bytes, host_nonce: bytes) -> bytes:
 
 
 def read_key(path: Path) -> bytes:
-    """Read a key; a CredentialsError if the file cannot be read, is not a key, or other users may read it."""
+    """Read a key from a file.
+
+    Raises a CredentialsError if the file cannot be read, contains no key, or is readable for other users.
+    """
     try:
         mode = path.stat().st_mode
         with path.open("rb") as file:

@@ -113,11 +113,11 @@ class Ros:
         return tuple(self._session.statuses)
 
     async def wait_for_state(self, state: State, timeout: float) -> None:
-        """Wait until the connection is in a state.
+        """Wait until the connection is in `state`.
 
         Raises:
-            StateTimeoutError: It did not reach the state in time.
-            DisconnectedError: The client is closed.
+            StateTimeoutError: The connection did not reach `state` within `timeout` seconds.
+            DisconnectedError: The client was closed.
         """
         await self._session.wait_for_state(state, timeout)
 

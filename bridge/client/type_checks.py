@@ -46,7 +46,7 @@ class TypeChecks:
         self._parts: dict[tuple[_Part, str], MessageCheck | None] = {}
 
     async def learn_message(self, type_name: str) -> None:
-        """Ask for the definition of a message type, unless it is known, to check messages before they are sent."""
+        """Unless a message type is known, get its definition from rosapi or rosbags, to check later messages."""
         session = self._session
         publications = session.core.publications
         if publications.is_known(type_name) or not session.is_open:

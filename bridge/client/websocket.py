@@ -191,7 +191,10 @@ class WebSocket(WebSocketTransport):
             self._early += messages
 
     def close_expected(self) -> None:
-        """Start the timeout after which the connection is aborted unless the server has ended it."""
+        """Schedule the abort of the connection after `CLOSE_TIMEOUT`, in case the server does not close it.
+
+        During the handshake, the connection is aborted at once.
+        """
         if self.opened:
             self._schedule(CLOSE_TIMEOUT)
         else:

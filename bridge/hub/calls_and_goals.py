@@ -352,7 +352,7 @@ class Actions(_Exchange):
         self.goals: dict[str, _Goal] = {}
 
     def leave(self, client: Client) -> None:
-        """Cancel the goals that a disconnected client sent, and abort those that it executed."""
+        """Cancel the goals that a disconnected client has sent, and abort the goals that the client was executing."""
         super().leave(client)
         # Nobody receives these results any more, so their servers may stop.
         for key in list(client.goals.values()):

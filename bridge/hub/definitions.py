@@ -151,7 +151,10 @@ class MessageDefinitions:
             return None
 
     def serialise(self, type_name: str, message: dict[str, Any], max_size: int) -> bytes:
-        """Serialise a message as in ROS 1, or for ROS 2 as CDR with its header, or raise a RefusedOperationError."""
+        """Serialise a message in the format of the hub's ROS version: as in ROS 1, or as CDR with the CDR header.
+
+        Raises a RefusedOperationError if the type is unknown, or if the message does not fit the type.
+        """
         store, known = self._known(type_name)
         try:
             built = Builder(store, max_size // _BYTES_A_VALUE).message(known, message, "")

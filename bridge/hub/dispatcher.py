@@ -1,4 +1,7 @@
-"""Dispatch of messages to clients' outboxes; lists of the clients with output, and of those with throttled messages."""
+"""Dispatch of messages to the outboxes of clients.
+
+The `Dispatcher` also keeps a list of the clients with output, and the set of clients with throttled messages.
+"""
 
 from math import inf
 from typing import Final
@@ -32,7 +35,7 @@ class Dispatcher:
         """Units of work in the current turn (see `bridge.hub.topics.TURN_WORK`)."""
 
     def mark_ready(self, client: Client) -> None:
-        """Add a client to the list of clients with output, unless it is already there."""
+        """Add a client to the list of clients with output. A client that is in the list is not added again."""
         if not client.is_ready:
             client.is_ready = True
             self._ready.append(client)

@@ -123,7 +123,7 @@ class Topic:
     largest: int
     """Maximum bytes of a message as JSON, so that it fits into an operation of the largest size."""
     type: str = ""
-    """Type in the form of this hub's ROS version; empty until a client names it."""
+    """Type in the form of this hub's ROS version, or an empty string while no client has named a type."""
     advertisements: dict[Client, Advertisement] = field(default_factory=dict)
     subscriptions: dict[Client, TopicSubscription] = field(default_factory=dict)
     latching: bool = False

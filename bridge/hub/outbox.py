@@ -25,7 +25,7 @@ _BRACE: Final = ord("{")
 
 
 def is_text(payload: bytes) -> bool:
-    """Return whether a payload is JSON, which begins with a brace, and not CBOR, whose maps begin with other bytes."""
+    """Return whether a payload is JSON and not CBOR. A JSON payload begins with a brace, and a CBOR map does not."""
     return payload[0] == _BRACE
 
 

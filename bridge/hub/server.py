@@ -385,7 +385,7 @@ class _Connection(WebSocketTransport):
                 self._hub.stay_awake(self.last_heard)
 
     def close_expected(self) -> None:
-        """Start the timeout after which the connection is aborted unless the client has ended it."""
+        """Remove the client, and abort the connection after `_CLOSE_TIMEOUT` if the client does not close it."""
         error = self._server_protocol.parser_exc
         if error is not None and self._client is not None and not isinstance(error, EOFError):
             self._hub.warn("the connection from %s is closed: %s", self._address, error)

@@ -300,7 +300,10 @@ class WebSocketTransport(asyncio.Protocol):
             self._read_turn(data, at)
 
     def _read_turn(self, data: bytes, at: int) -> None:
-        """Handle as many bytes as one turn allows, and the rest after other tasks had their turn."""
+        """Handle the bytes from index `at`, at most as many as one turn allows.
+
+        The remaining bytes are handled after other tasks have run.
+        """
         end = self._read(data, at)
         if end < len(data) or end - at >= self.turn_bytes or self._postponed or self.is_blocked:
             self._interrupt(data, end)

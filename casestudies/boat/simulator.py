@@ -233,7 +233,7 @@ async def _is_changed_before(due: float, boat: Boat) -> bool:
 
 
 async def _show_beacons(ros: "Ros") -> None:
-    """Publish the beacons as latched markers, so that later subscribers get them too."""
+    """Publish the beacons as latched markers, so that later subscribers also receive the markers."""
     from bridge.stamps import header
     from casestudies.topics import LossyPublication
 

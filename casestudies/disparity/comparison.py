@@ -34,7 +34,10 @@ def bad_share(disparity: NDArray[np.float64], truth: NDArray[Any]) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Matched:
-    """A stereo pair with its posteriors, float64[disparities, height, width], and the times they took."""
+    """The left image of a stereo pair, the posteriors of its pixels, and the times of the computation.
+
+    Posteriors are float64[disparities, height, width].
+    """
 
     left: NDArray[np.uint8]
     truth: NDArray[Any] | None

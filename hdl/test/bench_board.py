@@ -74,7 +74,7 @@ class SlowKernel:
 
 
 class Both:
-    """Both boards: each access is made on both, and their answers must be the same."""
+    """The simulated hardware and an emulated board. Each access is made on both, and both must answer alike."""
 
     def __init__(self, dut: Any, case: Case) -> None:
         self.dut = dut

@@ -34,7 +34,10 @@ class Connection:
     def __init__(
         self, connection: socket.socket, key: bytes, greeting: bytes, link: LinkModel | None = None
     ) -> None:
-        """Send the greeting, or a challenge before it if the board has a key; `link` delays all frames."""
+        """Send the first frame: a challenge if the board has a key, or else the greeting.
+
+        If `link` is not None, this model of a slower link delays all frames.
+        """
         no_delay(connection)
         if connection.family != socket.AF_UNIX:
             # a host whose machine or cable failed must not hold the board forever
@@ -132,7 +135,10 @@ class Connection:
         self.send(reply + self._greeting)
 
     def send(self, data: bytes) -> None:
-        """Send bytes, all those of an `answer` at once; close the connection if the peer accepts nothing for SEND_S."""
+        """Send bytes at once, or collect them while `answer` runs (see `_TOGETHER`).
+
+        If the peer accepts nothing for `SEND_S`, the connection is closed.
+        """
         self._unsent += data
         if not self._answering or len(self._unsent) >= _TOGETHER:
             self._flush()

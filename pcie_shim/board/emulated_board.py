@@ -33,7 +33,7 @@ from pcie_shim.register_layout import (
 from pcie_shim.register_map import BoardState, ErrorCode
 
 CHUNK_S: Final = 0.05
-"""Seconds that the machine runs at a time (a chunk); then the board reads from its host again."""
+"""Length of a chunk in seconds. After each chunk of running the machine, the board reads from its host."""
 
 _NO_ACCESS, _READ, _READ_WRITE = 0, 1, 3
 _SETTINGS: Final = struct.Struct(f"{SETTINGS.format}Q")  # and RUN_UNTIL
@@ -128,11 +128,11 @@ class EmulatedBoard:
     def load(self, content: bytes) -> None:
         """Program the board with the bytes of a programming file.
 
-        This prepares the machine (about 0.1 s), runs it for a few milliseconds to measure its speed, and
-        resets it.
+        The method prepares the machine, which takes about 0.1 s. It then runs the machine for a few milliseconds to
+        measure the machine's speed, and resets the machine.
 
         Raises:
-            RefusedError: The machine is running, or the image is damaged or for another register map.
+            RefusedError: The machine is running, the image is damaged, or the image is for another register map.
         """
         if self.running:
             raise RefusedError(ErrorCode.BUSY, "the machine is running; reset it before programming")

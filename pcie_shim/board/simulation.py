@@ -44,7 +44,10 @@ class SimulatorAnswer(NamedTuple):
 
 
 class Simulation:
-    """A running simulation; `speed` is its clocks per second while the machine runs, 0 until that was measured."""
+    """A running simulation.
+
+    `speed` is the number of simulated clocks per second while the machine runs, or 0 before a measurement.
+    """
 
     def __init__(self, command: Sequence[str], folder: Path) -> None:
         """Start the child, or raise a SimulationError; its first answer may take START_S."""
