@@ -96,7 +96,7 @@ class FrameReport:
 
     @property
     def is_biased(self) -> bool:
-        """True if boards of a BM2 reached their maximum number of cycles; `outcome` says which boards."""
+        """True if a board of a BM2 reached the maximum number of cycles. `outcome` says which boards did so."""
         return "ended_early" in self.details
 
     def link_us(self, rate: str) -> float | None:

@@ -32,7 +32,10 @@ LONGEST_LINE: Final = 1 << 20
 """Maximum number of bytes of a line from a child; a longer one is passed on in pieces."""
 
 RESTARTS = 3
-"""Restarts of a process that are allowed within the setting `restart_window`; at one more, its master gives up."""
+"""Maximum number of restarts of a process within the setting `restart_window`.
+
+If the process exits once more in this time, its parent ends with an error.
+"""
 
 
 def describe_exit(code: int | None) -> str:
@@ -131,7 +134,10 @@ class Child:
         self.restarts = 0
 
     async def start(self) -> None:
-        """Start the child in its own session, where no Ctrl-C reaches it; a StackError if its command is missing."""
+        """Start the child in its own session, so that a Ctrl-C does not reach the child.
+
+        Raises a StackError if the child's command cannot be started.
+        """
         self.close()
         self._error = ""
         lines, reports = self._pipes = [_Pipe(lambda line: relay(line, self.name)), _Pipe(self._take_report)]

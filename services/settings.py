@@ -170,11 +170,13 @@ class Settings(BaseModel):
 
 
 def load_settings(**flags: Any) -> Settings:
-    """Return the settings: flags that are not None override the environment, which overrides the defaults.
+    """Return the settings from flags, environment variables and defaults.
+
+    A flag that is not None overrides the environment variable. An environment variable overrides the default.
 
     Raises:
         SettingsError: A `BM_*` variable is unknown, or a value is invalid.
-        BridgeError: The robot in --uri does not announce itself.
+        BridgeError: The robot that `--uri` names does not announce itself.
     """
     # a misspelt variable would otherwise be ignored, for example in a unit file
     known = {ENV_PREFIX + name.upper() for name in Settings.model_fields}

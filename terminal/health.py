@@ -1,9 +1,9 @@
-"""Health of a process, reported on its status socket: whether it is ready, and the reason.
+"""Status socket of a process, which reports whether the process is ready, and the reason.
 
-A process listens on `NAME.status.sock` in the run directory, accessible only to its user (mode 0600). Each
-connection receives one JSON object with at least `ready` and `why`, and is closed; nothing is read from it.
-Because a health check runs every few seconds, this module imports only the standard library, and asyncio only
-in a server.
+A process listens on `NAME.status.sock` in the run directory. Only the user of the process can access the socket
+(mode 0600). Each client receives one JSON object with at least `ready` and `why`. The process reads nothing, and
+closes the connection. Because health checks run every few seconds, this module imports only the standard library.
+Only a server imports asyncio.
 """
 
 from __future__ import annotations

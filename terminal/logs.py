@@ -90,7 +90,7 @@ def formatted(level: str, text: str, *, name: str = "") -> str:
 
 
 def relayed(line: str, process: str) -> str:
-    """Return a line of a child in the current format; a JSON line from a child of the same version is not changed."""
+    """Return a line from a child in the current log format. A line that is a JSON log record is not changed."""
     if log_format() is LogFormat.TEXT or _is_record(line):
         return one_line(line)
     return json_line("info", line, process=process)
@@ -116,7 +116,7 @@ def write_progress(text: str) -> None:
 
 
 def _write(text: str) -> None:
-    """Replace the progress line by a text; a closed standard error is ignored, because it must not end a run."""
+    """Replace the progress line by a text. If standard error is closed, do nothing, so that the run continues."""
     with suppress(OSError, ValueError):
         if _Process.shows_progress:
             _Process.shows_progress = False

@@ -27,7 +27,7 @@ def say(text: str) -> None:
 
 
 def warn(sentence: str, *, name: str = "") -> None:
-    """Print a warning in one line on standard error; in the text format, it begins with `name`, the process's name."""
+    """Print a warning in one line on standard error. In the text format, the line begins with the process's `name`."""
     write_line(formatted("warning", one_line(sentence), name=name))
 
 

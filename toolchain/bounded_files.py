@@ -250,7 +250,10 @@ def _models_in(annotation: Any) -> list[type[BaseModel]]:
 def _followed(
     model: type[BaseModel], place: Sequence[str | int]
 ) -> tuple[list[str | int], list[type[BaseModel]]]:
-    """Follow a validation error's place through models; return it without section types, and the models at its end."""
+    """Follow the place of a validation error through nested models.
+
+    Returns the place without the steps that name the type of a section, and the models at the end of the place.
+    """
     followed: list[str | int] = []
     models = [model]
     for step in place:

@@ -361,7 +361,12 @@ def _do(address: str, client: Any, pickled: bytes, left: dict[int, None], keep: 
 
 
 def _results(address: str, batch: Any) -> tuple[list[Any], float]:
-    """Return the results of a batch; a ToolchainError if the batch failed, a `_LostError` if it is lost."""
+    """Return the results of a batch, and the seconds that the batch took.
+
+    Raises:
+        ToolchainError: The batch failed.
+        _LostError: The batch is lost.
+    """
     from distributed import KilledWorker
     from lz4.frame import decompress
 

@@ -25,7 +25,7 @@ _LAST_OUTPUT: Final = 1500  # characters
 
 
 class HardwareToolError(ToolchainError):
-    """A tool is missing or failed; the sentence names it and ends with its output."""
+    """Raised when a tool is missing or fails. The sentence names the tool and ends with the tool's last output."""
 
 
 def missing(tools: Iterable[str]) -> list[str]:

@@ -86,7 +86,10 @@ def exact_distance(
 
 
 async def fit(arguments: argparse.Namespace) -> Model:
-    """Return the model with the tables of a fit; without its file, fit to robot 3 first, or raise a ProcessError."""
+    """Return the model with the fitted tables in the file `arguments.fit`.
+
+    If the file does not exist, the model is first fitted to robot 3. Raises a ProcessError if the fit fails.
+    """
     landmarks = arguments.data / "landmarks.csv"
     if not arguments.fit.exists():
         print(f"learning {arguments.fit} from {RECORDINGS[0]} ...", file=sys.stderr)

@@ -77,7 +77,7 @@ _ENDS_LINK = {"kill", "corrupt", "repeat", "cut", "finish", "cut-inside", "memor
 _FAILS_BOARD = {*_ENDS_LINK, "stop", "hold"}
 _CUTS_ROSBRIDGE = {"gone", "finish", "nonsense", "cut-inside", "files"}
 _SILENCE = 9.0
-"""Seconds of silence above which a server may lose its clients; they give up a connection after 10 s."""
+"""Seconds of silence above which a server may lose its clients. A client gives up a silent connection after 10 s."""
 _REASONS = {
     "pcie-app": {WITH_APP},
     "publisher": {WITH_PUBLISHER, ROSBRIDGE_AWAY},
@@ -88,7 +88,10 @@ _REASONS = {
 
 
 def ended_roles(fault: Fault) -> tuple[str, ...]:
-    """Return the roles that a fault ends, once per end (see `ENDS`); a failed frame counts as an end of its board."""
+    """Return the roles that a fault ends, with one entry per end (see `ENDS`).
+
+    A frame that fails on a board counts as an end of the board.
+    """
     if fault.what == "misbehave":
         return ("boards", "boards")  # it has been killed before
     if fault.target == BOARDS_PARENT and fault.what == "kill":
@@ -234,4 +237,4 @@ NONSENSE = (
     b"HTTP/1.1 500 no\r\n\r\n",
     b"\x81\x7f\xff\xff\xff\xff\xff\xff\xff\xff",
 )
-"""Bytes that a server inserts between its messages; the last ones are not WebSocket frames."""
+"""Byte strings that a server inserts between its messages. The last two are not valid WebSocket frames."""

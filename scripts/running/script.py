@@ -54,7 +54,7 @@ def reporting_errors(work: Callable[[], int]) -> int:
 def print_table(
     title: str, columns: Sequence[str], rows: Iterable[Sequence[str] | None], *, left: int = 1
 ) -> None:
-    """Print a table whose first columns are aligned on the left; a row that is None ends a section."""
+    """Print a table with the first `left` columns aligned on the left. A None in `rows` ends a section."""
     table = Table(title=title, title_justify="left")
     for at, column in enumerate(columns):
         table.add_column(column, justify="left" if at < left else "right")

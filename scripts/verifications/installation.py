@@ -95,7 +95,10 @@ def install_roslibpy() -> Path:
 
 
 def install_node_packages(name: str, folder: Path) -> Path:
-    """Return the `node_modules` of a folder's package-lock.json, after installing them once; needs a recent Node."""
+    """Install the packages of a folder's package-lock.json once, and return the folder `node_modules`.
+
+    Raises a SettingsError if npm is missing or Node is older than `OLDEST_NODE`.
+    """
     node, npm = shutil.which("node"), shutil.which("npm")
     version = subprocess.run([node, "-v"], capture_output=True, text=True, check=True).stdout if node else ""
     if npm is None or int(re.sub(r"\D*(\d*).*\n?", r"\1", version) or 0) < OLDEST_NODE:

@@ -191,7 +191,10 @@ async def check_passes(stand: Server, sent: Any, type_name: str = ARRAY, **optio
 
 @contextlib.contextmanager
 def failing(error: type[Exception], otherwise: str, naming: str = "") -> Iterator[None]:
-    """Check that the block raises this error, with `naming` in its text; without an error, fail with `otherwise`."""
+    """Check that the block raises `error`, and that the text of the error contains `naming`.
+
+    If the block raises no error, the check fails with the text `otherwise`.
+    """
     try:
         yield
     except error as raised:

@@ -1,8 +1,8 @@
-"""The view of one browser: the newest frame or an earlier one, and its marginals, as messages for the page.
+"""The view of one browser: messages for the page with the newest or an earlier frame and its marginals.
 
-A message is binary: the length of its head (4 bytes, little-endian), the head (JSON), and the picture. A heat
-map has a byte for each cell, relative to the highest cell. Bars have a little-endian float32 each; for a BM2, the
-errors of the bars follow in the same form.
+A message is binary. It contains the length of the head (4 bytes, little-endian), the head (JSON), and the picture.
+A heat map has a byte for each cell, relative to the highest cell. A bar is a little-endian float32. After the bars
+of a BM2, the picture contains the sampling error of each bar as a little-endian float32.
 """
 
 import struct
@@ -167,7 +167,7 @@ def _shown(number: int | None) -> int | str | None:
 
 
 def _axis(label: str, size: int, axes: tuple[Axis, ...]) -> dict[str, Any]:
-    """Return an axis for the page; without a deployment, its values are the cells' indices."""
+    """Return an axis for the page. Without a deployment, the values of the axis are the cells' indices."""
     known = next((axis.dimension for axis in axes if axis.label == label and axis.dimension), None)
     return {
         "label": label,

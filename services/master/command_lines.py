@@ -62,7 +62,7 @@ _SETTINGS = {
     "publisher": ("uri", "ca", "ros_version", "connect_timeout", "seen_timeout", "use_sim_time"),
     "pcie-app": ("boards", "stop", "peer_timeout", "board_timeout", "key_file"),
 }
-"""Settings of one service beyond those that all services have. They become flags, so that `ps` shows them."""
+"""Settings of each service, besides the settings of all services. Settings become flags, so that `ps` shows them."""
 
 
 def service_arguments(role: str, endpoint: Endpoint, settings: Settings, *, reprogram: bool) -> list[str]:

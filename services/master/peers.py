@@ -194,10 +194,10 @@ class Peers:
     # --- starting and ending -------------------------------------------------------------------
 
     def prepare(self) -> None:
-        """Determine which peers are running, and how to start the others.
+        """Determine which peers are running, and how to start the other peers.
 
         Raises:
-            SettingsError: The endpoints are wrong.
+            SettingsError: The settings contain a wrong endpoint, or an endpoint together with `fused`.
             OccupiedError: Another run uses the run directory.
         """
         settings, deployment = self._settings, self._deployment

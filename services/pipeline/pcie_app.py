@@ -163,9 +163,9 @@ class PcieApp(RunService):
         self._searching = asyncio.ensure_future(search())
 
     def _answer(self, master: int, record: Record) -> None:
-        """Send the result of a frame, unless its master is gone.
+        """Send the result of a frame, unless the master that requested the frame is gone.
 
-        The next master also counts its frames from 1, and would take the result for one of its own.
+        A later master also numbers its frames from 1, and would take the result for the result of its own frame.
         """
         if master == self._link.masters:
             self._link.send(record)

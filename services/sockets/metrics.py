@@ -32,7 +32,10 @@ _Family = tuple[type[CounterMetricFamily | GaugeMetricFamily], str, str, str, Ma
 async def serve_metrics(
     address: Endpoint, name: str, get_status: Callable[[], ProcessStatus]
 ) -> AsyncIterator[None]:
-    """Serve metrics within the context; an occupied port only causes a warning: it must not end a robot's run."""
+    """Serve metrics within the context.
+
+    If the port is occupied, the function only prints a warning, because missing metrics must not end a robot's run.
+    """
     # a registry of its own: the default one adds metrics of Python under names that are not ours
     registry = CollectorRegistry(auto_describe=False)
     registry.register(_StatusCollector(get_status))

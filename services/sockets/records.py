@@ -135,8 +135,9 @@ reading.
 """
 
 Values = list[float | str | None]
-"""Values of a frame's readings as received, in the order of the variables, for its report; None for a missing
-reading, and for an array.
+"""Received values of a frame's readings, in the order of the variables, for the report of the frame.
+
+None stands for a missing reading, and for a reading that is an array.
 """
 
 

@@ -169,7 +169,10 @@ def model_of_codes(
 
 
 def _conditional(codes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Scale rows so that columns sum to about 1, then normalise the columns; a column of zeros becomes uniform."""
+    """Scale the rows of a table so that each column sums to about 1, then normalise each column.
+
+    A column of zeros becomes uniform.
+    """
     codes = np.where(codes.sum(axis=0) > 0, codes, 1.0)
     served = codes.sum(axis=1) > 0
     weights = served / max(int(served.sum()), 1)
@@ -245,7 +248,7 @@ class Frames:
 def recorded_frames(
     path: Path, variables: Sequence[Variable], given: Sequence[str], *, tolerance_s: float = 0.1
 ) -> Frames:
-    """Return all rows of a recording; the arguments are those of `recorded_readings`.
+    """Return all rows of a recording. `recorded_readings` describes the arguments.
 
     Raises:
         BuildError: A name in `given` is unknown, or a variable that must have a reading has no column.

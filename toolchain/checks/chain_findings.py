@@ -33,7 +33,7 @@ _STATE_BITS: Final = 20
 _PATTERN_BITS: Final = 24
 """Maximum sum of state bits and optional known variables at which it is checked that all states are connected."""
 _BLANKET_BITS: Final = 16
-"""Maximum number of bits that share a factor with one bit; all their values are tried in `Check.OPPOSITE_CLIPS`."""
+"""Maximum number of bits that share a factor with one bit. `Check.OPPOSITE_CLIPS` tries all values of these bits."""
 _RELATED_BITS: Final = 2048
 """Maximum number of random bits among which relations are searched, because all pairs of bits are kept."""
 _TIMEOUT_RISK: Final = 1e-6

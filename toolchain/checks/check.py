@@ -207,7 +207,7 @@ _WITHOUT_HEADER: Final = frozenset(
         "Twist", "TwistWithCovariance", "Vector3", "Wrench",
     )
 )  # fmt: skip
-"""Message types without a header in a package whose other types have one; no type of std_msgs has one."""
+"""Types of geometry_msgs without a header. Types of std_msgs are not listed, because none of them has a header."""
 _LEAST_TOLERANCE_S: Final = 0.005
 """Minimum tolerance, in seconds, with which messages sent together can be paired by their times of receipt."""
 

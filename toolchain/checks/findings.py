@@ -221,7 +221,7 @@ def _dead_prior(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def _readings(machine: CheckedMachine) -> Iterator[Finding]:
-    """Find readings with code 0 on every line; a frame with such a reading ends as `impossible`."""
+    """Find readings with code 0 on every line. A frame with one of these readings ends as `impossible`."""
     deployment, model = machine.deployment, machine.model
     alive = _alive(machine)
     if not alive.any() or machine.parameters.sensor_mode is not SensorMode.COLUMN:

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 FORMAT: Final = 1
 FILE_NAME: Final = "deployment.toml"
 FORMER_KEYS: Final = frozenset({"integrity", "integrity_frames"})
-"""Keys of a check that no longer exists, which files of earlier builds may have; they were never part of the hash."""
+"""Keys of a check that no longer exists. Files of earlier builds may have the keys. The hash never included them."""
 MOST_TRANSITIONS: Final = 2**24
 """Maximum number of transitions of a filter, lines x lines (128 MiB as float64)."""
 REPLICA: Final = "replica"
@@ -160,7 +160,10 @@ class Deployment(DeploymentFile):
 
     @property
     def state_dimensions(self) -> tuple[Dimension, ...]:
-        """The variables of a BM2's sampled state, in the order of their bits; empty if one is not described."""
+        """The variables of a BM2's sampled state, in the order of the state's bits.
+
+        The result is empty if the deployment does not describe all variables.
+        """
         keys = {"offset", "step", "unit", "states"}
         known = (Dimension(label=v.name, size=v.values, **v.model_dump(include=keys)) for v in self.variables)
         described = {each.label: each for each in (*known, *self.searched, *self.hidden)}

@@ -95,7 +95,10 @@ class Transition:
 
 
 def _header(shape: tuple[int, int]) -> bytes:
-    """Return the header that the file must have; it is not parsed, because a hostile one breaks NumPy's parser."""
+    """Return the NumPy header that the file must have.
+
+    The file's own header is compared and not parsed, because a hostile header breaks NumPy's parser.
+    """
     file = io.BytesIO()
     np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": shape})
     return file.getvalue()

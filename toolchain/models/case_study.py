@@ -24,7 +24,7 @@ _Result = TypeVar("_Result")
 
 
 def load_model(case: Path, settings: Mapping[str, str]) -> Model:
-    """Return the model of a case study's folder for a BM1; arguments and errors as for `load_question`."""
+    """Return the model of a case study for a BM1. `load_question` describes the arguments and errors."""
     found = load_question(case, settings)
     return found.model() if isinstance(found, Question) else found
 

@@ -72,9 +72,10 @@ class IntegerType:
 
 @dataclass(frozen=True, slots=True)
 class IntervalType:
-    """The real numbers from `low` to `high`, divided into equal intervals, each represented by its centre.
+    """The real numbers from `low` to `high`, divided into equal intervals. Each interval is represented by its centre.
 
-    With `wraps` they are on a circle: `high` is the same point as `low`, as for a bearing from 0 to 360.
+    With `wraps`, the numbers are on a circle, where `high` and `low` are one point. An example is a bearing from 0
+    to 360 degrees.
     """
 
     low: float

@@ -1,9 +1,9 @@
-"""Joint distributions as products of factors, and questions about them, as in ProBT.
+"""Joint distributions as products of factors, and questions about joint distributions, as in ProBT.
 
-A question with the form of naive fusion, P(S) P(k_1 | S) ... P(k_N | S) (equation 2.2), becomes a `Model`,
-which a BM1 computes. Symbols that are neither searched nor known are summed out exactly. A question of
-another form is refused with the path that joins two known symbols. Every question becomes a `NetworkModel`,
-which a BM2 samples.
+A BM2 samples any question, as a `NetworkModel`. A BM1 computes a question in the form of naive fusion,
+P(S) P(k_1 | S) ... P(k_N | S) (equation 2.2), as a `Model`. Symbols that are neither searched nor known are summed
+out exactly. If a question has another form, a BM1 cannot compute it. The error contains the path that joins two
+known symbols.
 """
 
 from __future__ import annotations

@@ -161,7 +161,10 @@ class Model:
     known: tuple[Known, ...]
     """The known variables in the order of the machine's columns, 1 to N."""
     prior: NDArray[np.float64] | None = None
-    """P(S), float64[lines] summing to 1; None means uniform or, with `prior_select`, the mean of its rows."""
+    """P(S), float64[lines] summing to 1.
+
+    None means a uniform prior. With `prior_select`, None means the mean of the rows of its table.
+    """
     prior_select: PriorSelect | None = None
     """The variable that selects the prior; if there is one, `prior` applies while nothing is selected."""
     transition: Transition | None = None

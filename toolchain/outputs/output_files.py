@@ -22,7 +22,7 @@ from toolchain.outputs.vhdl_parameters import PARAMETERS_FILE, parameters_vhd
 
 FAMILY: Final = "Stratix V"
 DEVICE: Final = "5SGSMD8K2F40C2"
-"""A Stratix V GS D8, as on the thesis's Proce V boards; check its package and speed grade against your board."""
+"""A Stratix V GS D8, as on the thesis's Proce V boards. Compare the package and speed grade with your board."""
 
 PROJECT: Final = "bm1"
 
@@ -128,7 +128,10 @@ def _encoded(memory: Memory) -> Iterator[bytes]:
 
 
 def only_emulated(deployment: Deployment) -> str:
-    """Return why the machine exists only in emulation, as a clause; empty if it also exists as hardware."""
+    """Return a clause that says why the machine exists only in emulation.
+
+    If the machine also exists as hardware, the result is an empty string.
+    """
     if not deployment.machine.kind.has_hardware:
         return f"the VHDL of a {deployment.machine.type} does not exist yet"
     return "rng = ideal exists only in emulation" if deployment.machine.rng is RngKind.IDEAL else ""

@@ -293,7 +293,7 @@ The script fails if the cluster's files differ from those of one process.
 
 
 def check_cluster(stack: Stack) -> None:
-    """Check the profile `cluster`: only dask starts, and its results have the same bytes as those of one process."""
+    """Check that the profile `cluster` starts only dask, and that dask and a single process write equal files."""
     with stack.cleared():
         try:
             stack.compose("--profile", "cluster", "up", "--detach", limit=UP_LIMIT)
