@@ -26,7 +26,7 @@ def header(time_ns: int, frame_id: str = "", ros_version: Literal[1, 2] | None =
 
 
 def stamp_ns(time: object) -> int | None:
-    """Return a time of either ROS version in nanoseconds since 1970; None if it is not a time."""
+    """Return a time of either ROS version in nanoseconds since 1970, or None if `time` is not a valid time."""
     if not isinstance(time, Mapping):
         return None
     # A message with both pairs has the same time in both, so the first one found is enough.
@@ -43,13 +43,13 @@ def stamp_ns(time: object) -> int | None:
 
 
 def header_stamp_ns(msg: Mapping[str, Any]) -> int | None:
-    """Return the `header.stamp` of a message in nanoseconds since 1970; None if it is missing or zero."""
+    """Return the `header.stamp` of a message in nanoseconds since 1970, or None if the stamp is missing or zero."""
     head = msg.get("header")
     return (stamp_ns(head.get("stamp")) or None) if isinstance(head, Mapping) else None
 
 
 def ros_version_of_message(msg: Mapping[str, Any]) -> Literal[1, 2] | None:
-    """Return the ROS version that a message's stamp shows; None without a header, or if the stamp has both forms."""
+    """Return the ROS version that a message's stamp shows, or None if there is no stamp or the stamp has both forms."""
     head = msg.get("header")
     time = head.get("stamp") if isinstance(head, Mapping) else None
     if not isinstance(time, Mapping) or ("sec" in time) == ("secs" in time):

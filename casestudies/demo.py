@@ -73,7 +73,10 @@ def boat(rates: Sequence[str], clock: float, *, array: bool) -> Case:
 
 
 def sprinkler(rates: Sequence[str], count: int) -> Case:
-    """Return the sprinkler on two chains; up to 256 frames have a bank of seeds each, so that none repeats another."""
+    """Return the sprinkler on two chains.
+
+    Each of at most 256 frames has its own bank of seeds, so no frame repeats the random numbers of another frame.
+    """
     options = {"machine": "bm2", "samples": 50_000, "stream": 4096, "rng-banks": min(max(count, 16), 256)}
     return Case(
         name="sprinkler",
@@ -203,7 +206,10 @@ def _check_port(whose: str, port: int, otherwise: str) -> None:
 
 
 async def _load_kernels() -> None:
-    """Load the emulated boards' kernels in a thread; master and boards, forked from this process, inherit them."""
+    """Load the kernels of the emulated boards in a thread.
+
+    Master and boards are forked from this process, so they inherit the loaded kernels.
+    """
     loop, loaded = asyncio.get_running_loop(), asyncio.Event()
 
     def load() -> None:

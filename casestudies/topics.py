@@ -99,7 +99,10 @@ SETTLED_S: Final = 3.0
 async def report_refused(
     ros: Ros, topic: str, type_: str, otherwise: str = "publish arrays with --array"
 ) -> None:
-    """Warn if the server does not list an advertised topic (rosapi); `otherwise` is what the user can do instead."""
+    """Warn if rosapi does not list an advertised topic, or lists the topic with another type.
+
+    The warning advises the user to install the message package, or else to do what `otherwise` says.
+    """
     await asyncio.sleep(SETTLED_S)
     known = await ros.topic_type(topic)
     if known is None or (known and same_type(known, type_)):

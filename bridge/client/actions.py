@@ -1,11 +1,11 @@
-"""Actions of ROS 2: goals that this client sends, and actions whose goals it executes.
+"""Actions of ROS 2: the client can send goals, and can execute the goals of an action that it offers.
 
-Method of the client, operation that it sends, and object that the program gets:
+A row has the method of the client, the rosbridge operation, and the object that the program gets:
 
     Ros.send_goal        ->  send_action_goal     ->  Goal, which receives feedback and the result
     Ros.advertise_action ->  advertise_action     ->  ActionServer, which runs a handler with each GoalRequest
 
-Actions of ROS 1 (actionlib) are topics, and are not supported (see `Ros.send_goal`).
+Actions of ROS 1 (actionlib) consist of topics. They are not supported (see `Ros.send_goal`).
 """
 
 import asyncio

@@ -417,7 +417,7 @@ class Session:
         return websocket is not None and websocket.is_open and not websocket.is_closing
 
     def check_thread(self) -> None:
-        """Raise an error unless this is the event loop's thread, because no lock protects the client's data."""
+        """Raise a WrongThreadError outside the event loop's thread, because no lock protects the client's data."""
         if get_ident() != self._thread and self._thread is not None:
             raise WrongThreadError(
                 f"the client of {self.uri} belongs to the thread of its event loop: call it there with "
@@ -479,7 +479,7 @@ class Session:
             self._waiting -= 1
 
     def flush(self) -> None:
-        """Send the core's output without waiting, since it is small and rare unless a server floods the client."""
+        """Send the core's output without waiting. The output is small and rare unless a server floods the client."""
         for message in self.core.data_to_send():
             websocket = self._websocket
             if websocket is not None and self.is_open:

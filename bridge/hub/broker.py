@@ -147,10 +147,11 @@ class Broker:
             self._refuse(client, str(error), self._operation_id, with_status=client.wants_status)
 
     def receive_turn(self, client: Client, messages: list[bytes], now: float) -> int:
-        """Perform a client's messages in order until `TURN_WORK` is reached; each has at most `limits.message_bytes`.
+        """Perform a client's messages in order until their work exceeds `TURN_WORK`.
 
-        Returns the number of messages performed. Call it again with the remaining ones; if the client's outbox
-        is congested, wait until the client has read its answers.
+        Each message must have at most `limits.message_bytes` bytes. Returns the number of messages performed. Call the
+        method again with the remaining messages. If the client's outbox is congested, first wait until the client has
+        read its answers.
         """
         self._now, self._operation_id = now, None
         dispatcher, outbox = self._dispatcher, client.outbox

@@ -121,7 +121,7 @@ class Topic:
     name: str
     """Absolute name."""
     largest: int
-    """Maximum bytes of a message as JSON, so that it fits into an operation of the largest size."""
+    """Maximum size of a message's JSON in bytes: the maximum of an operation minus the bytes around the message."""
     type: str = ""
     """Type in the form of this hub's ROS version, or an empty string while no client has named a type."""
     advertisements: dict[Client, Advertisement] = field(default_factory=dict)
@@ -140,7 +140,7 @@ class Offer:
     type: str
     client: Client
     fillers: Mapping[str, Filler]
-    """Fillers of absent fields, by part of the type, such as `Request`; empty if the type is unknown."""
+    """For each part of the type, such as `Request`, the filler of absent fields. Empty if the type is unknown."""
 
 
 class Graph:

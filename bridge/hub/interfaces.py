@@ -164,7 +164,7 @@ _ACTIONLIB: Final = {
 
 
 def part_name(type_name: str, part: str, ros_version: RosVersion) -> str:
-    """Return the name under which a part of a service or an action, such as its `Request`, is defined as a message."""
+    """Return the name of the message that defines a part of a service or an action, for example the `Request`."""
     package, _, name = type_name.partition("/")
     return f"{package}/msg/{name.rpartition('/')[2]}{'_' if ros_version == 2 else ''}{part}"
 

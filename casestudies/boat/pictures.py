@@ -46,7 +46,7 @@ def _reported(field: str) -> Callable[[Instance], float | None]:
 
 
 def _of_computing(instance: Instance) -> tuple[float | None, float | None]:
-    """Split the wait for the boards into the time of computing and that of the link, in us; each None if unknown."""
+    """Split the wait for the boards into computing time and link time, in us. Both are None if the wait is unknown."""
     if instance.report is None or (waited := instance.report.stages.compute) is None:
         return None, None
     own = instance.report.stages.boards_compute

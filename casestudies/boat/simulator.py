@@ -77,14 +77,15 @@ DRIVE_TIMEOUT: Final = 1.0
 
 
 class Boat:
-    """The simulated world: a boat that starts in the middle of the map, its sensors and the beacons (thesis 4.1).
+    """A simulated boat with its sensors, and the beacons (thesis 4.1). The boat starts in the middle of the map.
 
-    Two boats with the same seed and the same switches sail the same route and measure the same readings.
+    Boats with equal seeds and equal switches sail the same route and measure the same readings.
 
     Attributes:
         heading: Direction of the bow, in radians counter-clockwise from the x axis.
-        switches: The state of each of `SWITCHES`, True for on. `put` and `drive` turn `sail` off.
-        changed: Set when somebody moves the boat or sets a switch, and cleared when the next reading is published.
+        switches: The state of each of `SWITCHES`, True for on. The methods `put` and `drive` turn `sail` off.
+        changed: Event that is set when somebody moves the boat or sets a switch. Publishing the next reading clears
+            the event.
     """
 
     def __init__(self, seed: int, speed: float) -> None:

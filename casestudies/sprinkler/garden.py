@@ -17,7 +17,7 @@ from terminal.signals import run_async
 
 
 def mornings(seed: int) -> Iterator[tuple[int, int, int]]:
-    """Draw R, S and G of one morning after the other from the model; the same seed gives the same mornings."""
+    """Yield R, S and G of one morning after another, drawn from the model. Equal seeds give equal mornings."""
     draw = random.Random(seed).random
     while True:
         r = int(draw() < RAIN)

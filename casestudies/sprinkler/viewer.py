@@ -52,9 +52,9 @@ class FrameSummary:
     share: float
     """P(R = 1) in the posterior on `/BMresults`."""
     error: float
-    """Standard error of `share`, from `/bm/frame`; 0.5, the largest possible, if the report lacks it."""
+    """Standard error of `share`, from `/bm/frame`. If the report has no standard error, this is 0.5, the maximum."""
     effective: float
-    """Number of effective samples, from `/bm/frame`; 1 if that does not state it."""
+    """Number of effective samples, from `/bm/frame`. If the report has no such number, this is 1."""
     curve: NDArray[np.int64]
     """int64[points, 2]: a number n, and how many of the first n samples have R = 1. The last n counts all samples."""
 

@@ -1,9 +1,11 @@
-"""Comparison of the VHDL board with the emulated board: both get the same accesses and must give the same answers.
+"""Comparison of the VHDL board with the emulated board.
+
+Both boards get the same accesses and must give the same answers:
 
     random accesses --+--> AXI4-Lite --> bm1 (GHDL)  --> answers, counters, states of the generators
                       +--> EmulatedBoard             --> the same?
 
-This is a cocotb module, which `simulation.run_bench` runs. The variable `HDL_SEED` selects the case.
+`simulation.run_bench` runs this cocotb module. The environment variable `HDL_SEED` selects the case.
 """
 
 from __future__ import annotations
@@ -199,7 +201,7 @@ class Both:
                     break
 
     async def wait_for_seeds(self) -> None:
-        """Wait until all generators have their seeds after a reset, which takes one clock for each generator."""
+        """Wait until all generators have their seeds after a reset. Loading the seeds takes one clock per generator."""
         for _ in range(self.slow.rng_state.size + 8):
             if self.dut.core.seeds_ready.value == 1 and self.dut.rstn_i.value == 1:
                 return

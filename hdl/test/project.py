@@ -68,7 +68,7 @@ def reference_kernel(machine: BM1Machine) -> BM1Kernel:
 
 
 def image_of(machine: BM1Machine, more_inputs: int = 0, more_results: int = 0) -> Image:
-    """Return a board's image of a machine; its interface has `more_inputs` and `more_results` words to spare."""
+    """Return a board's image of a machine. The interface has `more_inputs` and `more_results` unused words."""
     used = BM1.registers(machine.parameters)
     inputs, results = used.input_words, used.result_words
     return Image(

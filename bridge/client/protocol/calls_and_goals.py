@@ -1,4 +1,6 @@
-"""Service calls and action goals of a client, and the services and actions that it serves.
+"""Service calls and action goals of a client, and the services and actions that a client offers.
+
+On the left, the client is the caller. On the right, the client offers the service or action.
 
 call_service (id)          ->  server      server  ->  call_service (id)
 service_response (id)     <-                      <-   service_response (id)
