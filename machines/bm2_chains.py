@@ -248,7 +248,7 @@ class Chains:
         return fast.wiring_of(self._machines[0])
 
     def _run_in_step(self, moves: Moves, start: BM2Start, states: list[int], seeds: Words) -> _Ran | None:
-        """Run `IN_STEP` chains in step; return None if a chain may reach a limit before it has drawn its samples."""
+        """Run `IN_STEP` chains in step, or return None if a limit may stop a chain before its last sample."""
         parameters, cdes, row = self._parameters, self._parameters.cdes, fast.row_size(self._parameters)
         numbers = aligned((IN_STEP, cdes, row), np.uint16)
         values, addresses, results, clock = (

@@ -92,7 +92,10 @@ class Chain(NamedTuple):
 
 
 class FastBM2(BM2Kernel):
-    """A kernel that runs many cycles at a time (thesis 2.1.3); a MachineError unless the generators are LFSRs."""
+    """A kernel that runs many cycles at a time (thesis 2.1.3).
+
+    The constructor raises a MachineError if the generators are not LFSRs.
+    """
 
     def __init__(self, machine: BM2Machine) -> None:
         super().__init__(machine)
@@ -203,7 +206,7 @@ def load_state(parameters: BM2Parameters, state: int, values: Words, addresses: 
 
 
 def wiring_of(machine: BM2Machine) -> Wiring:
-    """Return the wiring of a machine with LFSRs, which is the same for all seeds."""
+    """Return the wiring of a machine with LFSRs. The wiring does not depend on the seeds."""
     parameters = machine.parameters
     # the CDEs whose factor has a bit, and the bit's place in that factor
     concerned: list[list[tuple[int, int]]] = [[] for _ in range(parameters.state_bits)]

@@ -37,7 +37,10 @@ STREAM_WORDS_MAX: Final = 4096
 """Maximum number of words of the stream's buffer: the size of the block STREAM in the register map."""
 
 BATCHES: Final = 20
-"""Number of batches of samples in a frame without a stream; their means show how much samples depend on each other."""
+"""Number of batches into which the samples of a frame without a stream are divided.
+
+The means of the batches show how much samples depend on each other.
+"""
 
 STREAM_BYTES_MAX: Final = 3 << 20
 """Maximum size in bytes of a frame's streams, of all boards together: one message between services carries them."""
@@ -191,12 +194,12 @@ class BM2Kind(MachineKind):
     def posterior(
         self, machines: Sequence[BM2Machine], frame: FrameInput, variables: Sequence[str] = ()
     ) -> tuple[npt.NDArray[np.float64], Mapping[str, str]]:
-        """Return the posterior of a frame, and statistics, from chains that run one after the other in this process.
+        """Return the posterior and the statistics of a frame. Its chains run one after another in this process.
 
-        Each chain has the samples that it would have on its board.
+        Each chain draws the same samples as on a board.
 
         Raises:
-            NoPosteriorError: The frame has none.
+            NoPosteriorError: The frame has no posterior.
         """
         inference = self.infer(run_batches(kernels_of(machines), frame), variables)
         if inference.posterior is None:

@@ -279,7 +279,7 @@ class MachineKind(ABC):
 
     @abstractmethod
     def machine(self, parameters: Any, sections: Mapping[str, npt.NDArray[Any]]) -> Any:
-        """Return the machine with a file's parameters and sections; a MachineError if it cannot be built."""
+        """Return a machine with the parameters and sections of a programming file, or raise a MachineError."""
 
     # ---- board ----------------------------------------------------------------------------------------
 

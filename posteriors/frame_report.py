@@ -79,8 +79,9 @@ class FrameReport:
     cycles: int | None = None
     counts_total: int | None = None
     link_bytes: int | None = None
-    """Bytes between pcie-app and all boards, in both directions; `link_transfers` is the number of their transfers."""
+    """Bytes between pcie-app and all boards, in both directions."""
     link_transfers: int | None = None
+    """Number of transfers that carried the `link_bytes`."""
     received_ns: int | None = None
     """Time at which the subscriber received the reading (Unix time)."""
     sent_ns: int | None = None

@@ -358,7 +358,7 @@ class EmulatedBoard:
             self._publish(BoardState.DONE, machine.reason, cycles)
 
     def _chunk_end(self, cycles: int, max_cycles: int) -> int:
-        """Return the cycle at which the next chunk ends, at most the slice's end; 0 if it runs to the frame's end."""
+        """Return the cycle at which the next chunk ends, at most the slice's end. 0 stands for the frame's end."""
         end = cycles + self._chunk
         if end - cycles > _ALIGNMENT:
             end -= end % _ALIGNMENT

@@ -88,7 +88,10 @@ _CLOSING_CODES: Final = (ErrorCode.STALE, ErrorCode.HELD, ErrorCode.BAD_FRAME)
 
 
 class SocketLink:
-    """An open link over a socket; it closes itself when the stream cannot be trusted."""
+    """An open link over a socket.
+
+    After an overdue answer or a damaged frame, the link closes itself, because later data cannot be trusted.
+    """
 
     def __init__(self, endpoint: Endpoint, *, timeout: float, connect_timeout: float) -> None:
         """Connect and receive the greeting; use `open`, which also checks it."""

@@ -117,7 +117,10 @@ def mib_of(pid: int) -> float:
 
 
 async def memory(visit: Visit, pid: int, minutes: float) -> Rows:
-    """Measure the memory of dashboard and browser for some minutes; compare the end of this time with its middle."""
+    """Measure the memory of dashboard and browser for some minutes.
+
+    The rows compare the end of this time with the middle.
+    """
     await visit.page.evaluate("window.paints.push = () => 0")  # what this bench keeps is not the page's
     session = await visit.page.context.new_cdp_session(visit.page)
     taken: dict[str, list[float]] = {}

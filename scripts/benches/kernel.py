@@ -211,7 +211,7 @@ def measure(runs: dict[str, Callable[[], Sampled]]) -> dict[str, Sampled]:
 
 
 def show(title: str, speeds: dict[str, Sampled]) -> None:
-    """Print a table; its last column is a row's sweeps per second relative to the first row."""
+    """Print a table of speeds. The last column is each row's sweeps per second, divided by the first row's."""
     rows = []
     single = next(iter(speeds.values()))
     for name, each in speeds.items():

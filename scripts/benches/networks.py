@@ -59,7 +59,7 @@ Marginals: TypeAlias = Mapping[int, NDArray[np.float64]]
 
 @dataclass(frozen=True, slots=True)
 class Network:
-    """A network as our toolchain and as pyagrum read it. Its variables are numbered as in the machine."""
+    """A Bayesian network, read by this project's toolchain and by pyagrum. Variables are numbered as in the machine."""
 
     model: NetworkModel
     zeros: int

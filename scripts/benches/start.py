@@ -48,7 +48,13 @@ DEMO = {"deployment written": "deployment/deployment.toml"}
 
 
 async def steps(folder: Path, files: Mapping[str, str], *command: str, **variables: str) -> dict[str, float]:
-    """Run a command, and return the time of each step, in seconds; raise a ProcessError if it fails."""
+    """Run a command, and return the seconds from its start to each step.
+
+    A step in `files` is reached when the step's file exists in `folder`.
+
+    Raises:
+        ProcessError: The command failed.
+    """
     run = folder / "run"
     run.mkdir(parents=True, mode=0o700)
     began, times = time.monotonic(), {}

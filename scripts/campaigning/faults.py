@@ -33,7 +33,10 @@ class Kind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Fault:
-    """One fault: kind, action, target, duration, and a number whose meaning depends on the action."""
+    """One fault: its kind, action (`what`), target and duration (`seconds`).
+
+    The meaning of `number` depends on the action.
+    """
 
     kind: Kind
     what: str

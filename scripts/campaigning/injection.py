@@ -28,7 +28,10 @@ class Injector:
     def __init__(
         self, stack: Stack, topology: Topology, clock: Path, publish: Callable[[str, int], Awaitable[None]]
     ) -> None:
-        """Store `clock`, the file with the clock's offset, and `publish`, which publishes readings (kind, number)."""
+        """Store the parameters.
+
+        `clock` is the file with the offset of the clock. `publish(kind, number)` publishes readings.
+        """
         self._stack = stack
         self._topology = topology
         self._clock = clock

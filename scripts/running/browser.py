@@ -144,7 +144,10 @@ class Visit:
         return float(await self.page.evaluate("window.moved"))
 
     async def mean_near(self, to: Place) -> float:
-        """Wait until a posterior with its mean near `to` is painted after a drag; return the browser's time."""
+        """Wait until, after a drag, the page paints a posterior with a mean near `to`.
+
+        Returns the time of this paint by the browser's clock.
+        """
         found = await self.until(
             """([x, y, near]) => {
                 const {clientWidth, clientHeight} = document.querySelector('[data-testid=posterior]');

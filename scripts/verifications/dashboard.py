@@ -360,7 +360,7 @@ async def verify(arguments: argparse.Namespace) -> int:
 
 
 async def run_check(tally: Tally, name: str, check: Callable[[Scene], Awaitable[None]], scene: Scene) -> None:
-    """Run one check and report it; a check also fails if the browser complains about a page."""
+    """Run one check and report its result. The check also fails if the browser reports an error on a page."""
     started, why = time.monotonic(), None
     try:
         await check(scene)

@@ -74,7 +74,7 @@ def use_packages(name: str, lock: Path) -> Path:
 
 
 def install_roslibpy() -> Path:
-    """Return the folder with roslibpy's environment (venv) and source (source); install them at the first call."""
+    """Return the folder with roslibpy's environment (`venv`) and source (`source`). The first call installs both."""
 
     def make(folder: Path) -> None:
         run(sys.executable, "-m", "venv", folder / "venv")

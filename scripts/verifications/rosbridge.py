@@ -74,7 +74,7 @@ READY: Final = rf"{real_rosbridge.READY}|ws://\S+"
 
 
 class Server(Stand):
-    """A server that can be restarted, its clients, and the masters on it; each process has a log of its own."""
+    """A server that can be restarted, with its clients and masters. Each process writes a log of its own."""
 
     def __init__(self, kind: str, port: int, deployments: dict[str, Path]) -> None:
         super().__init__(OUT / kind)

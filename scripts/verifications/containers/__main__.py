@@ -38,7 +38,11 @@ from toolchain.deployment import load_deployment
 ENGINE: Final = ROOT / "scripts" / "container-engine"
 BUILD_LIMIT = 900.0 * FACTOR
 DOWNLOAD_FAILED, NOT_ABLE, TERMINATED = 3, 4, 143
-"""Exit codes: of this command after a failed download, or if it cannot run containers; of a service after SIGTERM."""
+"""Exit codes: two of this command, and one of a service.
+
+This command exits with 3 after a failed download, and with 4 if the machine cannot run containers. A service exits
+with 143 after SIGTERM.
+"""
 ROBOT_PORT, BOARD_PORT = 9191, 7100
 MINE: Final = "build/mine"
 

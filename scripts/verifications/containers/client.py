@@ -65,7 +65,7 @@ def differences(instance: Instance, addresses: tuple[int, ...]) -> str:
 
 
 async def check(uri: str, count: int) -> None:
-    """Print a line for each result until `count` of them are recomputed; exit with 1 at a wrong one."""
+    """Recompute `count` results, and print a line for each result. Exit with 1 at a wrong result."""
     heard: dict[int, tuple[int, ...]] = {}
     async with connect(uri) as ros, listen(ros) as listener:
         receiving = asyncio.create_task(receive(ros, heard))

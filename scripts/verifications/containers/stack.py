@@ -160,7 +160,10 @@ class Stack:
 
     @contextlib.contextmanager
     def cleared(self, **variables: str) -> Iterator[None]:
-        """Remove the project and set variables; after the block, remove it again; if it failed, save the logs."""
+        """Remove the project and set variables. Remove the project again after the block.
+
+        If the block fails, save the logs.
+        """
         self.down()
         self.variables |= variables
         try:

@@ -130,7 +130,7 @@ async def rviz(scene: Scene) -> None:
 
 
 def flaw_of(picture: "Image.Image", grid: dict[str, Any], pose: dict[str, Any]) -> str | None:
-    """Return how the picture of rviz's window differs from grid and pose; None if it shows them."""
+    """Return how the picture of rviz's window differs from grid and pose, or None if the picture is right."""
     pixels = np.asarray(picture.convert("RGB"), int)
     grey = (pixels == BACKGROUND).all(axis=2)
     down, across = (np.flatnonzero(grey.sum(axis=axis) > FEW) for axis in (1, 0))
