@@ -1,7 +1,7 @@
-"""Child processes: starting, monitoring, restarting and stopping them, also when their parent ends.
+"""Child processes: starting, monitoring, restarting and stopping. When the parent ends, its children end too.
 
-parent ◀─ standard error ──────── child   lines for the user, which are passed on
-       ◀─ ROSBAYES_ERROR_DESCRIPTOR       {"error": "the sentence that explains its end"}
+parent ◀─ standard error ──────── child   lines that the parent passes on to the user
+       ◀─ ROSBAYES_ERROR_DESCRIPTOR       {"error": "the sentence that explains the child's end"}
 """
 
 import asyncio

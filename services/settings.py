@@ -1,4 +1,4 @@
-"""Settings of all services, from the first source that has them: flag, `BM_*` variable, deployment, default."""
+"""Settings of all services, each from a flag, a `BM_*` variable, the deployment or a default, in this order."""
 
 import difflib
 import os

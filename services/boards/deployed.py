@@ -62,7 +62,10 @@ class DeployedBoards:
         return f"{count} {'board' if count == 1 else 'boards'} programmed and open"
 
     def status(self, output: FrameOutput | None) -> list[BoardStatus]:
-        """Return the state of each board, with its cycles in the last frame's `output`; any thread may call this."""
+        """Return the state of each board. Any thread may call this method.
+
+        `output` is the output of the last frame. The states contain the boards' cycles from `output`.
+        """
         # a copy, because the boards' thread changes it meanwhile
         gone = dict(self.gone)
         return [
@@ -79,7 +82,7 @@ class DeployedBoards:
         ]
 
     def run(self, frame: FrameRequest) -> FrameOutput:
-        """Compute one frame, or raise a BoardError; a failed board is in `gone` until `recover` has reopened it."""
+        """Compute one frame, or raise a BoardError. Lost boards are then in `gone` until `recover` reopens them."""
         try:
             return self._whole_cluster().run(self._input(frame))
         except BoardError as error:

@@ -59,7 +59,10 @@ class SimulatedHardware:
             self._compiled(image)
 
     def board(self, index: int) -> RtlBoard:
-        """Return a blank board, or raise a SimulationError; if its image is known, the simulation already runs."""
+        """Return a blank board, or raise a SimulationError.
+
+        If the board's image is known, the simulation of the image already runs.
+        """
         from pcie_shim.board.rtl_board import RtlBoard
 
         board = RtlBoard(self._simulate)

@@ -220,7 +220,10 @@ class BoardProcesses:
         self._report()
 
     def _hear(self, at: int, *, listens: bool) -> None:
-        """Handle a board's sign that it lives or listens; print when all boards are ready, or when one is back."""
+        """Handle the sign of board `at` that the board lives or, with `listens`, that the board listens.
+
+        Print a line when all boards listen. From then on, print a line for each board that listens again.
+        """
         self._heard[at] = time.monotonic()
         if not listens:
             return

@@ -50,7 +50,10 @@ def source_of(uri: str, topic: str, type_: str) -> Source:
 
 
 def results_of(settings: Settings, topic: str | None) -> tuple[Deployment | None, str | None, str]:
-    """Return the settings' deployment, if any, and the URI and topic of its results; flags override the deployment."""
+    """Return the settings' deployment, if any, and the URI and topic of the results.
+
+    A flag or variable overrides the URI or topic of the deployment.
+    """
     # here, because boards and `status` start without the bridge and deployments
     from posteriors.posterior import RESULTS_TOPIC
     from services.sockets.serving import deployment_for

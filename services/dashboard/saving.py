@@ -23,7 +23,7 @@ def same_shape(frames: Sequence[KeptFrame], shown: KeptFrame | None) -> list[Kep
 
 
 def archive(frames: Sequence[KeptFrame], axes: Sequence[Axis]) -> bytes:
-    """Return an archive for `numpy.load`, with the same array names as `listen --save`; `frames` must not be empty."""
+    """Return at least one frame as an archive for `numpy.load`. Array names are as in `listen --save`."""
     file = io.BytesIO()
     write_archive(
         file,
@@ -37,7 +37,7 @@ def archive(frames: Sequence[KeptFrame], axes: Sequence[Axis]) -> bytes:
 
 
 def table(frames: Sequence[KeptFrame]) -> bytes:
-    """Return a CSV table with each frame's most probable cell and all probabilities; `frames` must not be empty."""
+    """Return at least one frame as a CSV table, with each frame's most probable cell and all probabilities."""
     labels, first = frames[0].labels, frames[0].values
     cells = cell_names(labels, first.shape) if first is not None else ()
     file = io.StringIO(newline="")

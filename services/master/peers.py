@@ -450,7 +450,10 @@ class Peers:
         await child.start()
 
     async def _ended(self, child: Child) -> None:
-        """Wait for the end of a process that has closed its connection; kill it if it takes too long."""
+        """Wait until a process that has closed its connection exits.
+
+        If the process still runs after `stop_timeout`, kill it.
+        """
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(child.wait(), self._settings.stop_timeout)
         if child.is_running:

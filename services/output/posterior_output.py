@@ -67,7 +67,10 @@ def _best(posterior: Posterior, axes: list[Axis]) -> str:
 
 
 def _means(posterior: Posterior, axes: list[Axis]) -> list[str]:
-    """Return the part of a line with the means, as a list; it is empty if the values of all axes are names."""
+    """Return a list with the part of a line that shows the means.
+
+    The list is empty if the values of all axes are names.
+    """
     numbers = [axis for axis in axes if not axis.has_states]
     return [f"mean {in_words(numbers, posterior.mean())}"] if numbers else []
 

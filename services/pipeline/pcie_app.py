@@ -145,7 +145,10 @@ class PcieApp(RunService):
         self._post_next()
 
     def _fail(self, error: BoardError) -> None:
-        """Search for other lost boards, so that boards that die together fail only one frame; then report the error."""
+        """Find all lost boards, then report the error.
+
+        The search comes first so that only one frame fails if several boards die together.
+        """
         if self._posted is None:
             return
         (number, master), self._posted = self._posted, None

@@ -39,7 +39,7 @@ _BURST_PAUSE = 0.02
 """Seconds of silence that end the backlog sent to a new subscriber."""
 _BURST_LIMIT = 0.1
 _BACKLOG_LIMIT = min(1 << 18, MAX_RECORD)
-"""Maximum number of bytes that wait for the master; beyond it, readings are dropped (queue = latest)."""
+"""Number of bytes that may wait for the master. If more bytes wait, `queue = latest` drops readings."""
 
 
 async def newest_message(subscription: Subscription, message: Message) -> tuple[Message, int]:

@@ -18,11 +18,11 @@ from toolchain.deployment import Deployment, Source
 
 
 async def print_variables(settings: Settings, source: Source, names: list[str], count: int | None) -> int:
-    """Print the named variables in each message of a topic; if `names` is empty, print whole messages.
+    """Print the named variables in each message of a topic, or whole messages if `names` is empty.
 
     Raises:
         NoMessageError: No message came in time.
-        BridgeError: A message does not have a variable, the topic has another type, or the server is unreachable.
+        BridgeError: A message lacks a variable, the topic has another type, or the server is unreachable.
     """
     fields = [Field(name) for name in names]
     size, report = settings.message_bytes, report_waits()

@@ -26,7 +26,7 @@ _decoder: msgspec.msgpack.Decoder[AnyRecord] = msgspec.msgpack.Decoder(AnyRecord
 
 
 def encode_record(record: Record) -> bytes:
-    """Return the bytes of one framed record; raise a LocalSocketError if it is larger than MAX_RECORD."""
+    """Return the bytes of one framed record, or raise a LocalSocketError if the record exceeds `MAX_RECORD` bytes."""
     body = _encoder.encode(record)
     if len(body) > MAX_RECORD:
         raise LocalSocketError(

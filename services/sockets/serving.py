@@ -265,7 +265,7 @@ class RunService(ABC):
 
 
 async def report_failure(link: Link, error: BaseException) -> None:
-    """Send to the master the error that ends its service; a bug is not sent, because the service prints it."""
+    """Send the master the error that ends this service. A bug is not sent, because the service prints the bug."""
     code = exit_code_of(error)
     if code == ExitCode.BUG or not isinstance(error, Exception):
         return
@@ -314,12 +314,13 @@ def deployment_for(settings: Settings, *, images: bool = False) -> Deployment:
 
 
 def board_endpoints(settings: Settings, deployment: Deployment) -> list[Endpoint]:
-    """Return the endpoints of the boards: those in the settings, otherwise those of the deployment.
+    """Return the boards' endpoints from the settings or, if the settings have none, from the deployment.
 
-    A folder, `unix:/folder/`, stands for all boards that `board --directory` runs there.
+    The endpoint `unix:/folder/` stands for all boards that `board --directory` runs in this folder.
 
     Raises:
-        SettingsError: A board has no endpoint, or there are too few or too many.
+        SettingsError: A board has no valid endpoint, or the number of endpoints is wrong.
+        CredentialsError: The file with the boards' key is unusable.
     """
     # a flag or variable replaces all endpoints of the deployment, never some of them
     texts = settings.boards or tuple(board.endpoint for board in deployment.boards)
