@@ -69,7 +69,7 @@ class Forked:
         return self.returncode
 
     def send_signal(self, number: int) -> None:
-        """Send a signal; the pid still belongs to the forked process, because its exit has not been collected."""
+        """Send a signal. No other process can have the pid, because the forked process's exit is not collected yet."""
         os.kill(self.pid, number)
 
     def kill(self) -> None:

@@ -64,7 +64,7 @@ def run_directory(given: Path | None) -> Path:
 
 
 def status_directory(given: Path | None, name: str) -> Path | None:
-    """Return the run directory of a process without a master; if it is unusable, warn and return None."""
+    """Return the run directory of a process without a master, or warn and return None if the folder is unusable."""
     try:
         return run_directory(given)
     except OutputError as error:

@@ -39,11 +39,11 @@ class NotFusionError(ModelError):
 
 
 class NetworkFileError(ModelError):
-    """A network file is damaged, hostile, or of another format; the error names file and line."""
+    """A network file is damaged, hostile, or of another format. The error names the file and the line."""
 
 
 class MifError(ToolchainError):
-    """A memory file is not a MIF, or its words do not fit the memory; the error names file and line."""
+    """A memory file is not a MIF, or its words do not fit the memory. The error names the file and the line."""
 
 
 class BuildError(ToolchainError):

@@ -24,7 +24,10 @@ _FRAMES: Final = 20
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChainInspection:
-    """Results of an inspection; `exact` is the error from `chain_error`, or None if the chain is too large for it."""
+    """Results of an inspection.
+
+    `exact` is the result of `chain_error`. If the chain is too large for this function, `exact` is None.
+    """
 
     deployment: Deployment
     machine: BM2Machine

@@ -79,8 +79,10 @@ class Of(StrEnum):
     The logic of the bit compares the random number with the code, and tests the code for all ones and all zeros. It
     also has a part of the AND of bm1_tile_element."""
     COUNTER_BIT = "counter bit"
-    """A bit of a counter, in bm1_counter, bm1_readout and bm1_matrix: its increment, its comparison with the target,
-    and its selection for the host."""
+    """A bit of a counter, in bm1_counter, bm1_readout and bm1_matrix.
+
+    The logic of the bit increments the counter, compares the count with the target, and selects the bit for the host.
+    """
     STATE_BIT = "state bit"
     """A bit of the state of an LFSR (bm1_lfsr): its logic loads the seed, or the state after a cycle's steps."""
     STEP = "step"

@@ -75,7 +75,10 @@ class Replay:
     machines: Sequence[Any]
     frames: Frames
     earlier: Callable[[int], tuple[_Posterior, int] | None] | None = None
-    """Function that returns what an interrupted run computed for a row, if anything; needed only if `is_sequence`."""
+    """Function that returns a row's posterior and cycles from an interrupted run, or None if that run lacks the row.
+
+    If `is_sequence` is False, the function is not needed.
+    """
 
     @property
     def is_sequence(self) -> bool:

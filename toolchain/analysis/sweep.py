@@ -115,7 +115,7 @@ class Results:
             self.points[point.key] = point
 
     def check_writable(self) -> None:
-        """Create the file if it is missing; raise a BuildError before a long run if it cannot be written."""
+        """Create the file if it is missing. Raise a BuildError, before a long run, if the file cannot be written."""
         with file_errors(self.path, "written", BuildError), self.path.open("ab"):
             pass
 

@@ -152,7 +152,11 @@ def clipped(factor: NDArray[np.float64], prob_bits: int) -> tuple[int, int, int]
 
 
 def chain_layout(parameters: BM2Parameters, interface: tuple[int, int] | None) -> BoardLayout:
-    """Return the layout of the boards, each of which has one chain; errors are those of `fitted_layout`."""
+    """Return the layout of boards with one chain each.
+
+    Raises:
+        BuildError: A board has too many seeds, or the registers that a board uses do not fit the interface.
+    """
     check_seeds(parameters)
     what = (
         f"a state of {counted(parameters.state_bits, 'bit')}, {parameters.histogram_words} words of histograms and "

@@ -51,7 +51,7 @@ class ColumnLoss:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VanishedFloor:
-    """An outlier floor that is so low that it becomes code 0; `what` and `advice` are clauses for the user."""
+    """An outlier floor so low that its code is 0. `what` and `advice` are clauses of a message to the user."""
 
     name: str
     what: str
@@ -158,7 +158,10 @@ def scaled(table: NDArray[np.float64], scale: Scale) -> NDArray[np.float64]:
 
 
 def _loss(name: str, bits: int, exact: NDArray[np.float64], quantised: NDArray[np.float64]) -> ColumnLoss:
-    """Compare P(S, K) with the table of the codes, whose rows may have any scale; both are float64[values, lines]."""
+    """Compare `exact`, P(S, K), with `quantised`, the table of the codes. Both are float64[values, lines].
+
+    Rows of `quantised` may have any scale.
+    """
     weight = exact.sum(axis=1)
     remaining = quantised.sum(axis=1)
     alive = (remaining > 0) & (weight > 0)

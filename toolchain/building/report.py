@@ -1,6 +1,6 @@
-"""The report of a build: what was built and what was lost, in plain sentences (thesis 3.4).
+"""The report of a build: sentences on what was built and what was lost (thesis 3.4).
 
-It has no dates or paths, so the same input gives the same bytes.
+The report has no dates or paths, so equal inputs give equal bytes.
 """
 
 from collections.abc import Sequence

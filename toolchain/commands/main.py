@@ -137,7 +137,10 @@ def deployment(directory: Directory, edits: DeploymentEdits, verbose: Verbose = 
 
 
 def _lines(directory: Path) -> list[str]:
-    """Return the lines of `deployment.toml`; none if the file is missing, which loading the deployment reports."""
+    """Return the lines of `deployment.toml`, or an empty list if the file is missing.
+
+    A missing file is reported when the deployment is loaded.
+    """
     file = directory / FILE_NAME
     return file.read_text(encoding="utf-8", errors="replace").splitlines() if file.is_file() else []
 

@@ -41,7 +41,10 @@ class FittedRecording(Section):
 
 
 class FittedVariable(Section):
-    """`[[variable]]` of a fit file; with the method `counts`, only name and rows, because the `.npz` has its table."""
+    """A `[[variable]]` of a fit file.
+
+    With the method `counts`, the fit file has only `name` and `rows`, because the `.npz` file has the table.
+    """
 
     name: str
     rows: int = Field(ge=0)

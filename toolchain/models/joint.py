@@ -310,10 +310,10 @@ class Question:
         ]
 
     def _refusal(self) -> NotFusionError:
-        """Return an error with two dependent observed symbols, the path of arcs between them, and advice.
+        """Return an error that names two dependent observed symbols and the path of arcs between both, with advice.
 
-        If the observed symbols are not all independent, two of them are dependent, regardless of the others (a property
-        of d-separation).
+        By d-separation, if a set of observed symbols is not independent, then at least two of its symbols are dependent
+        as a pair.
         """
         factors, pairs = self._pairs()
         path: list[str] = []

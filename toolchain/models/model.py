@@ -68,7 +68,10 @@ class TabulatedVariable:
     table: NDArray[np.float64] = field(repr=False)
     """float64[values, lines]; row k is for the reading with address k."""
     bits: int = 0
-    """Address bits; 0 for the fewest that suffice for the values and the top address, which means a missing reading."""
+    """Number of address bits. 0 selects the smallest sufficient number.
+
+    Each value needs an address, and a missing reading needs the top address.
+    """
     offset: float = 0.0
     """The reading with address 0, in the unit of the variable."""
     step: float = 1.0

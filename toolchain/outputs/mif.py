@@ -24,7 +24,7 @@ MOST_BYTES: Final = 1 << 30
 """Maximum size of a file in bytes."""
 
 MOST_WORDS: Final = 1 << 24
-"""Maximum number of words in a memory; without it, a few bytes of a file could declare any depth."""
+"""Maximum number of words in a memory. Without this limit, a short file could declare a memory of any depth."""
 
 MOST_WIDTH: Final = 1 << 20
 """Maximum width of a word in bits: 4096 lines with the widest codes have 65,536."""
