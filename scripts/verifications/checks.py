@@ -45,7 +45,7 @@ class Tally:
     ) -> Iterator[None]:
         """Run the block as a check, and report the result.
 
-        The check fails if the block raises a CheckError or one of `errors`. Then the report also has the text of `details`.
+        If the block raises a CheckError or one of `errors`, the check fails, and the report has the text of `details`.
         """
         started, why = time.monotonic(), None
         known: tuple[type[Exception], ...] = (CheckError, *errors)

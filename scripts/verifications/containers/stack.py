@@ -69,7 +69,8 @@ class Stack:
     ) -> str:
         """Run docker and return its output.
 
-        Raises a CheckError if docker's exit code is not in `codes`, or if docker runs longer than `limit` seconds.
+        Raises a CheckError if docker runs longer than `limit` seconds. If `check` is true, also raises a CheckError if
+        docker's exit code is not in `codes`.
         """
         what = f"docker {' '.join(arguments[:3])}"
         with (OUT / "docker.log").open("a") as log:
