@@ -56,7 +56,10 @@ StopWhen: TypeAlias = Annotated[Stop, STOP]
 
 
 def add_commands(app: CommandLine, *commands: Callable[..., None]) -> None:
-    """Add functions to a command line as commands of the same names; a dataclass parameter becomes a flag per field."""
+    """Add each function to a command line, as a command with the function's name.
+
+    If a parameter of a function is a dataclass, each field of the dataclass becomes a flag.
+    """
     for command in commands:
         parameters = inspect.signature(command, eval_str=True).parameters
         kinds = {name: each.annotation for name, each in parameters.items()}

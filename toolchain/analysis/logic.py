@@ -21,7 +21,10 @@ from toolchain.outputs.mif import LENGTH
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Device:
-    """An FPGA and its board; a design that needs more than the share `usable` of it cannot be placed and routed."""
+    """An FPGA on a board.
+
+    A design that needs more than the share `usable` of the FPGA's resources cannot be placed and routed.
+    """
 
     name: str
     title: str

@@ -93,7 +93,10 @@ def _union(chances: NDArray[np.float64], random: np.random.Generator, *, shared:
 
 
 def _share(chances: NDArray[np.float64], options: BuildOptions, cycles: int) -> float:
-    """Return the expected share of lost frames; cycles beyond the period of an LFSR do not make it smaller."""
+    """Return the expected share of lost frames after `cycles` cycles.
+
+    Cycles beyond the period of the LFSRs do not reduce this share.
+    """
     width = options.rng.lfsr_bits
     return float(((1 - chances) ** (cycles if width is None else min(cycles, 2**width - 1))).mean())
 

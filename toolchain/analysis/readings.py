@@ -56,10 +56,10 @@ class Readings:
         return addresses, None if row == MISSING else row
 
     def of_machine(self, frame: int, machine: BM1Machine) -> tuple[Inputs, int]:
-        """Return a frame in the form for a machine: a missing reading is the top address of its column.
+        """Return the inputs and the prior's row of a frame in the form for a machine.
 
-        If lines have their own readings, those of all lines are returned, even if the machine has only some
-        of them.
+        A missing reading becomes the top address of the column. If each line has readings of its own, the readings of
+        all lines are returned, even if the machine has only some of the lines.
         """
         parameters = machine.parameters
         row = int(self.prior_addresses[frame])

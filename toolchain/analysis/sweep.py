@@ -285,7 +285,10 @@ def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[P
 
 
 def _name_points(axes: Any, names: Iterable[tuple[tuple[float, float], str]]) -> None:
-    """Write names beside points, the highest first; a name that would cover another goes lower, joined to its point."""
+    """Write names beside points, beginning with the highest point.
+
+    If a name would cover another name, the name is written lower, with a line to the point.
+    """
     line = 9.5
     dots = axes.figure.dpi / 72
     axes.get_xlim()  # sets the limits, on which the places depend

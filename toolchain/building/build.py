@@ -78,7 +78,7 @@ class Built:
     report: str
     """The content of `report.txt`."""
     transition: Transition | None = None
-    """The transition of a filter, which `[filter]` of the deployment refers to; None without a filter."""
+    """The transition of the filter, or None without a filter. `[filter]` in `deployment.toml` contains its hash."""
 
 
 REPORT_NAME: Final = "report.txt"
@@ -210,7 +210,10 @@ def _model_hash(plan: MachinePlan | BM2Plan, codes: Sequence[NDArray[Any]]) -> s
 
 
 def describe(plan: MachinePlan | BM2Plan, layout: BoardLayout, images: Sequence[Image]) -> Deployment:
-    """Return the deployment that lists these images, with its hash; a BuildError if an option does not fit."""
+    """Return the deployment that lists these images. The deployment contains its own hash.
+
+    Raises a BuildError if an option does not fit.
+    """
     model, options = plan.model, plan.options
     own: dict[str, Any]
     hidden: tuple[Dimension, ...] = ()

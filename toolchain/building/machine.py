@@ -39,7 +39,10 @@ def machine_options(source: BuildOptions | MachineSection, keys: Iterable[str]) 
 
 
 def option(key: str, options: BuildOptions, section: type[BM1Section | BM2Section]) -> int:
-    """Return the value of an option; if it is None, the default that `section` (`[machine]`) has for it."""
+    """Return the value of the option `key`. If the option is None, return the default of this key in `section`.
+
+    `section` is the class of the section `[machine]`.
+    """
     asked = getattr(options, key)
     return int(section.model_fields[key].default if asked is None else asked)
 

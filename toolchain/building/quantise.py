@@ -149,7 +149,11 @@ def _quantised_prior(model: Model, prob_bits: int, scale: Scale) -> tuple[NDArra
 
 
 def scaled(table: NDArray[np.float64], scale: Scale) -> NDArray[np.float64]:
-    """Return a table, float64[values, lines], with each row, or the whole table, divided by its maximum; zeros stay."""
+    """Return a table, float64[values, lines], divided by maxima according to `scale`.
+
+    `ADDRESS` divides each row by the maximum of the row. `COLUMN` divides the whole table by the table's maximum.
+    `NONE` divides nothing. A row of zeros remains zero.
+    """
     if scale is Scale.NONE:
         return table
     largest = table.max(axis=1, keepdims=True) if scale is Scale.ADDRESS else np.asarray(table.max())

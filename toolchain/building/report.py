@@ -159,7 +159,10 @@ def edited_sentence(deployment: Deployment) -> str:
 
 
 def _topics_sentence(deployment: Deployment) -> str:
-    """Name the topic of the posteriors and the sources of readings; several sources are listed with their variables."""
+    """Return a sentence with the topic of the posteriors and the sources of the readings.
+
+    If there are several sources, the sentence lists the variables of each source.
+    """
     output = deployment.outputs[0]
     places = [f"{source.uri}, topic {source.topic} ({source.type})" for source in deployment.sources]
     if len(places) == 1:

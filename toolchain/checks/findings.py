@@ -63,7 +63,7 @@ class Check(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """A finding of a check about a part of a model or machine; `advice` says what to change, if anything."""
+    """A finding of a check about a part of a model or machine. If the user can change something, `advice` says what."""
 
     severity: Severity
     check: Check

@@ -19,7 +19,7 @@ class FitMethod(StrEnum):
 
 
 class FitPrior(StrEnum):
-    """The table with which counting starts; the fewer readings there are, the more it matters."""
+    """The table with which counting starts. If there are few readings, this table has much influence on the result."""
 
     MODEL = "model"
     """The model's own table."""

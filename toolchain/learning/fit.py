@@ -77,7 +77,10 @@ class Support:
 
 
 def locate(model: Model, columns: Mapping[str, Sequence[object]], rows: int) -> TrueCells:
-    """Find the usable rows among `rows` rows; `columns` has the true values of each dimension, by its label."""
+    """Find the usable rows among `rows` rows, and the true position in each of the usable rows.
+
+    `columns` contains a column of true values for the label of each searched dimension.
+    """
     places = np.array(
         [[_position(dimension, value) for value in columns[dimension.label]] for dimension in model.searched]
     ).reshape(len(model.searched), rows)
@@ -132,7 +135,10 @@ def fit_model(
 
 
 def _position(dimension: Dimension, value: object) -> float:
-    """Return a true value as a position along a dimension in cells; NaN if it is not a value."""
+    """Return a true value as a position along a dimension, in cells.
+
+    If `value` is neither a state of the dimension nor a number, the position is NaN.
+    """
     if isinstance(value, str) and value in dimension.states:
         return float(dimension.states.index(value))
     if isinstance(value, str) or not isinstance(value, int | float):

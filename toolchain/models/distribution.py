@@ -164,13 +164,13 @@ class Symbol:
     """A variable with its name and type. For a known variable, `path` is the place of its readings in the message."""
 
     name: str
-    """Name of the symbol, and of its field in the message unless `path` is given."""
+    """Name of the symbol. If `path` is empty, the symbol's field in the message also has this name."""
     type: Type
     """The type, which defines the symbol's values."""
     path: str = ""
-    """Path of its field in the message; empty to search the message for the name."""
+    """Path of the symbol's field in the message. If the path is empty, the message is searched for the name."""
     bits: int = 0
-    """Address bits of its column in the machine; 0 for the fewest that suffice."""
+    """Number of address bits of the symbol's column in the machine. 0 means the fewest bits that suffice."""
     on_range: Literal["error", "clamp", "missing"] = "error"
     """Treatment of a reading out of range: an error, the nearest end, or a missing reading."""
     on_missing: Literal["error", "missing"] = "error"

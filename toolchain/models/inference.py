@@ -266,7 +266,10 @@ class Links:
         return before
 
     def drawn(self, path: Sequence[str]) -> str:
-        """Return a path as text with arrows, shortened if it is long; two parents are joined by their common child."""
+        """Return a path as text with arrows. A long path is shortened.
+
+        If two neighbours on the path are parents of one child, the child stands between the two: `A -> child <- B`.
+        """
         arrows = [self._arrow(before, after) for before, after in pairwise(path)]
         if len(path) > _LONGEST_DRAWN:
             arrows[_SHOWN:-_SHOWN] = [f" ... {path[-1 - _SHOWN]}"]

@@ -172,8 +172,7 @@ class Question:
         """Return the model that a BM1 computes.
 
         Raises:
-            NotFusionError: The question is not naive fusion; the sentence contains the path that joins two known
-                symbols.
+            NotFusionError: The question is not naive fusion. The error names the path that joins two known symbols.
             ModelError: The question is impossible, or needs a table above the limit.
         """
         observed = [symbol.name for symbol in self.observed]

@@ -171,8 +171,10 @@ class Model:
     prior_select: PriorSelect | None = None
     """The variable that selects the prior; if there is one, `prior` applies while nothing is selected."""
     transition: Transition | None = None
-    """The searched variable's change between frames; only for a filter, whose prediction for the first frame is
-    `prior`."""
+    """The transition of the searched variable between frames, or None without a filter.
+
+    With a filter, `prior` is the prediction for the first frame.
+    """
 
     def __post_init__(self) -> None:
         name = self.name if isinstance(self.name, str) else ""  # a user's file is not type-checked

@@ -35,7 +35,10 @@ class Place(Protocol):
 
 
 class NetworkBuilder:
-    """A builder of a joint distribution; its methods raise a NetworkFileError for wrong or too large parts."""
+    """A builder of a joint distribution from the parts of a network file.
+
+    The methods raise a NetworkFileError if a part is wrong or too large.
+    """
 
     def __init__(self, path: Path, *, on_missing: Literal["error", "missing"] = "error") -> None:
         self.path = path

@@ -46,7 +46,10 @@ class Memory:
     board: int | None = None
     """The board that has this memory, or None if all boards have the same."""
     section: str = ""
-    """The section of the programming file with the memory's codes; empty for seeds, which follow from parameters."""
+    """The section of the programming file that contains the memory's codes.
+
+    A memory of seeds has an empty `section`, because the seeds follow from the machine's parameters.
+    """
 
     def lines(self) -> Iterator[str]:
         """Yield the MIF, in canonical form."""

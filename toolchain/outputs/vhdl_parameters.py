@@ -220,7 +220,7 @@ def _memory_files(images: Sequence[Image]) -> str:
 _TOKEN: Final = re.compile(r'\n|--[^\n]*|\w*"[^"\n]*"|[\w.]+|:=|=>|[^\s]')
 _MOST_BYTES: Final = 4 << 20
 _FLAGS: Final = {"RNG_KIND": " --rng", "RNG_SHARED": " --per-cell", "RNG_BANKS": " --rng-banks"}
-"""For each constant of the generators, the build's flag that changes it; an error about a wrong constant names it."""
+"""The flag of the build that changes each constant of the generators, for errors about a wrong constant."""
 _IMAGE_HASH: Final = re.compile(r'(image_hash\s*=>\s*)x"[0-9a-f]{64}"')
 
 
