@@ -303,8 +303,9 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
 
     Return False if a chain may reach a limit before its end.
 
-    `vectors` contains `numbers`, `values`, `pointed`, `counts` and `room`. `counts` has a counter of samples for each
-    state but 0. Its other counter counts sweeps, and overflows at the end of the burn-in and at the end of the chain.
+    `vectors` contains `numbers`, `values`, `pointed`, `counts` and `room`. `counts` has a counter for each
+    state. The counters of states 1 and up count samples. The counter of state 0 counts sweeps instead, and overflows at
+    the end of the burn-in and at the end of the chain.
     `room` is working space for carries, for the bits of contexts, and for the events of a sample.
     """
     numbers, values, pointed, counts, room = vectors

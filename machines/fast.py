@@ -110,7 +110,7 @@ class FastBM1(BM1Kernel):
         return 0 if self._of_frame else self._kept_blocks * BLOCK_CYCLES
 
     def prepare(self) -> None:
-        """Cache the words of the first `PREPARED_CYCLES` cycles of every bank, in at most 0.1 s."""
+        """Cache the words of the first `PREPARED_CYCLES` cycles of every bank, or of as many as fit the cache."""
         blocks = min(self.kept_cycles, PREPARED_CYCLES) // BLOCK_CYCLES
         for bank in range(self.machine.parameters.rng_banks if blocks else 0):
             self._restart(bank)

@@ -174,7 +174,7 @@ def image(maps: Words, which: int, state: np.uint64) -> np.uint64:
 
 @jit
 def jump(jumps: Words, states: Words, clocks: int, later: Words) -> None:
-    """Write the states after `clocks` more clocks to `later`; `clocks` has at most as many bits as a state."""
+    """Advance the states by a number of clocks, with at most a state's number of bits; store the result in `later`."""
     for column in range(states.shape[0]):
         state = states[column]
         for bit in range(jumps.shape[0]):

@@ -289,7 +289,7 @@ class MachineKind(ABC):
 
     @abstractmethod
     def contents(self, machine: Any) -> Blocks:
-        """Return the registers' words that come with an image, except those of `UsedRegisters.capabilities`."""
+        """Return the words that the registers have after an image is loaded, without `UsedRegisters.capabilities`."""
 
     @abstractmethod
     def kernel(self, machine: Any) -> Any:

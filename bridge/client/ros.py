@@ -69,10 +69,10 @@ class Ros:
             await self._session.close()
 
     def together(self) -> AbstractContextManager[None]:
-        """Write everything published inside the block at once: `with ros.together(): ...`.
+        """Send everything that is published inside the block together at its end: `with ros.together(): ...`.
 
-        Messages that belong together then wake up the server only once. Nothing is sent before the block
-        ends, so the block should not wait for anything.
+        Messages that belong together then wake up the server only once. Nothing is sent before the block ends, so the
+        block should not wait for anything.
         """
         return self._session.together()
 

@@ -59,8 +59,8 @@ def decode(
         max_size: Maximum number of bytes.
         max_depth: Maximum nesting of maps, arrays and tags. The outermost level counts. An empty map or array at
             the innermost level does not count.
-        arrays: Form of typed arrays and byte strings. `list` makes lists of numbers, and `bytes` of `uint8[]`.
-            `numpy` makes read-only one-dimensional arrays.
+        arrays: Form of typed arrays and byte strings. With `list`, a `uint8[]` becomes `bytes`, and every other array
+            a list of numbers. With `numpy`, each becomes a read-only one-dimensional array.
 
     Returns:
         The map of the message, whose numbers may be NaN or infinite.

@@ -64,7 +64,7 @@ class Dashboard:
         self._stats: tuple[float, bytes] = (0.0, b"")
 
     def application(self) -> FastAPI:
-        """Return the web application; the framework is set up once in a process."""
+        """Return the web application. Call this only once in a process, because it sets up NiceGUI for the process."""
         application = FastAPI(openapi_url=None, docs_url=None, redoc_url=None)
         application.add_api_websocket_route("/live", self._live)
         application.add_api_route("/frames.{kind}", self._file)

@@ -33,7 +33,7 @@ MACHINE_KEYS: Final = tuple(
 
 
 def machine_options(source: BuildOptions | MachineSection, keys: Iterable[str]) -> dict[str, Any]:
-    """Return the values of `keys` in `source`, except keys that no build option sets and values that are None."""
+    """Return the values that `source` has for those of `keys` that are build options, without values of None."""
     options = [key for key in keys if key in BuildOptions.__dataclass_fields__]
     return {key: value for key in options if (value := getattr(source, key)) is not None}
 

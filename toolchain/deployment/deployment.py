@@ -1,4 +1,4 @@
-"""The deployment: everything that follows from the model, its checks, its hash and its file (thesis 3.3, 3.4)."""
+"""The deployment: all that services must know of a model and its machine, with checks, hash and file (thesis 3.3)."""
 
 import hashlib
 import json

@@ -120,9 +120,9 @@ def apply_fit(model: Model, fit: Fit, where: str = "the fit") -> Model:
 
 
 def cell_spread(model: Model, known: Known) -> NDArray[np.float64]:
-    """Return the standard deviation of a variable's mean within the cell of each line: float64[lines].
+    """Return how much a variable's mean varies within each line's cell, as a standard deviation: float64[lines].
 
-    The searched values are assumed uniform within a cell, and the mean linear.
+    The mean is taken as linear in the searched values, and these values as uniform within the cell.
     """
     slopes = mean_slopes(model, known)
     spread: NDArray[np.float64] = np.sqrt((slopes**2).sum(axis=0) / 12)

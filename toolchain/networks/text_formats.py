@@ -379,9 +379,9 @@ def read_uai(data: bytes, builder: NetworkBuilder) -> None:
 
     In the format, a factor's last variable varies fastest. In a BAYES file, this variable is the child.
 
-    Two programs deviate from the format. pyagrum 3.3.1 writes the first parent fastest. pgmpy 0.1 to 1.1 lists the
-    variables in the format's order, but writes the numbers so that the first variable varies fastest and the child
-    slowest. A file is read in pgmpy's order if a table sums to 1 only in that order.
+    pgmpy 0.1 to 1.1 writes each table with its axes reversed, so that the first variable varies fastest and the child
+    slowest. If a table sums to 1 only in that order, the whole file is read in that order. pyagrum 3.3.1 writes the
+    first parent fastest; this is not detected.
     """
     text = Scanner(data, builder.path, comments=_UAI_COMMENTS)
     kind = text.word("BAYES or MARKOV")

@@ -242,7 +242,7 @@ LENGTH: Final = 1 << 16
 
 
 def table_length(machine: BM1Machine | BM2Machine) -> int:
-    """Return the length of a machine's table of random numbers, or of a generated one if it has none."""
+    """Return the length of a machine's own table of random numbers, or of `random_table` if it has no table."""
     return LENGTH if machine.rng_table is None else machine.rng_table.size
 
 
