@@ -75,7 +75,7 @@ class Robot:
 async def discover(timeout: float = 2.0) -> list[Robot]:
     """Return the rosbridge servers that answer within `timeout` seconds, sorted by name.
 
-    The function waits for this whole time, even if servers answer earlier.
+    The function always waits for the whole time.
 
     Raises:
         DiscoveryError: The package `zeroconf` is not installed, or there is no network.

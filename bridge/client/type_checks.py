@@ -46,7 +46,7 @@ class TypeChecks:
         self._parts: dict[tuple[_Part, str], MessageCheck | None] = {}
 
     async def learn_message(self, type_name: str) -> None:
-        """Unless a message type is known, get its definition from rosapi or rosbags, to check later messages."""
+        """Get the definition of an unknown message type from rosapi or rosbags, to check later messages of the type."""
         session = self._session
         publications = session.core.publications
         if publications.is_known(type_name) or not session.is_open:

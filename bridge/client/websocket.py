@@ -191,10 +191,7 @@ class WebSocket(WebSocketTransport):
             self._early += messages
 
     def close_expected(self) -> None:
-        """Schedule the abort of the connection after `CLOSE_TIMEOUT`, in case the server does not close it.
-
-        During the handshake, the connection is aborted at once.
-        """
+        """Abort the connection after `CLOSE_TIMEOUT` unless the server closes it. Abort a handshake at once."""
         if self.opened:
             self._schedule(CLOSE_TIMEOUT)
         else:

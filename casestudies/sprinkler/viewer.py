@@ -36,10 +36,7 @@ _COLOURS: Final = ("#aa7744", "#4477aa")
 _POINTS: Final = 200
 """Number of points at which the running estimate of a frame is drawn."""
 _WAITING: Final = 4
-"""Maximum number of sample messages that are kept to find the samples of a frame.
-
-If no kept message fits the frame, the samples of the frame are lost.
-"""
+"""Maximum number of sample messages kept to find a frame's samples. If none fits, the frame's samples are lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

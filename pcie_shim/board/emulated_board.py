@@ -128,8 +128,8 @@ class EmulatedBoard:
     def load(self, content: bytes) -> None:
         """Program the board with the bytes of a programming file.
 
-        The method prepares the machine, which takes about 0.1 s. It then runs the machine for a few milliseconds to
-        measure the machine's speed, and resets the machine.
+        The method prepares the machine (about 0.1 s), measures the machine's speed for a few milliseconds, and resets
+        the machine.
 
         Raises:
             RefusedError: The machine is running, the image is damaged, or the image is for another register map.

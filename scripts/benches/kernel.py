@@ -43,10 +43,7 @@ RATIO_AIMS: Final = {"sprinkler": 10, "alarm": 2}
 MANY: Final = {"sprinkler": 512, "alarm": 32}
 """Number of chains of a network that run at once, for comparison with one chain."""
 TURNS: Final = 3
-"""Number of measurements of each alternative.
-
-The fastest measurement counts, because other processes can only slow a measurement down.
-"""
+"""Number of measurements of each alternative. The fastest counts, because other processes only slow programs down."""
 BURN_IN: Final = 100
 Ints: TypeAlias = NDArray[np.int64]
 Floats: TypeAlias = NDArray[np.float64]

@@ -191,10 +191,7 @@ async def check_passes(stand: Server, sent: Any, type_name: str = ARRAY, **optio
 
 @contextlib.contextmanager
 def failing(error: type[Exception], otherwise: str, naming: str = "") -> Iterator[None]:
-    """Check that the block raises `error`, and that the text of the error contains `naming`.
-
-    If the block raises no error, the check fails with the text `otherwise`.
-    """
+    """Check that the block raises `error` with `naming` in the text. Without an error, fail with `otherwise`."""
     try:
         yield
     except error as raised:

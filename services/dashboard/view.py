@@ -2,7 +2,7 @@
 
 A message is binary. It contains the length of the head (4 bytes, little-endian), the head (JSON), and the picture.
 A heat map has a byte for each cell, relative to the highest cell. A bar is a little-endian float32. After the bars
-of a BM2, the picture contains the sampling error of each bar as a little-endian float32.
+of a BM2, the sampling errors of the bars follow as little-endian float32.
 """
 
 import struct

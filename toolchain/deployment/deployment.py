@@ -160,10 +160,7 @@ class Deployment(DeploymentFile):
 
     @property
     def state_dimensions(self) -> tuple[Dimension, ...]:
-        """The variables of a BM2's sampled state, in the order of the state's bits.
-
-        The result is empty if the deployment does not describe all variables.
-        """
+        """The variables of a BM2's sampled state, in the order of the state's bits, or () if one is not described."""
         keys = {"offset", "step", "unit", "states"}
         known = (Dimension(label=v.name, size=v.values, **v.model_dump(include=keys)) for v in self.variables)
         described = {each.label: each for each in (*known, *self.searched, *self.hidden)}

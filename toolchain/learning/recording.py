@@ -37,7 +37,7 @@ class Recording:
     rows: int
     """The number of rows."""
     columns: dict[str, list[object]]
-    """The values of each row, by the name of the column. A value is a number, a text, or None if it is missing."""
+    """For each column name, the values of all rows. A value is a number, a text, or None if it is missing."""
     stamps: tuple[int, ...] = ()
     """The time of each row in nanoseconds. A CSV file has times only if it has a time column and `stamped` is set."""
 

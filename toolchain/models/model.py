@@ -166,7 +166,7 @@ class Model:
     prior: NDArray[np.float64] | None = None
     """P(S), float64[lines] summing to 1.
 
-    None means a uniform prior. With `prior_select`, None means the mean of the rows of its table.
+    None means a uniform prior. With `prior_select`, None means the mean of the rows of the prior table.
     """
     prior_select: PriorSelect | None = None
     """The variable that selects the prior; if there is one, `prior` applies while nothing is selected."""
