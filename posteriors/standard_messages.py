@@ -1,6 +1,6 @@
-"""Topics that robot tools show by themselves: counts, grid, pose, decision and health as standard ROS messages.
+"""Results as standard ROS messages, which robot tools can show: counts, grid, pose, decision and health.
 
-Conversions only: `services/pipeline/standard_topics.py` publishes them (docs/reference/topics.md).
+`services/pipeline/standard_topics.py` publishes the messages (docs/reference/topics.md).
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from toolchain.deployment import Deployment, Dimension
 
 MAP_FRAME: Final = "map"
-"""The tf frame of grid and pose, in which the searched variables are coordinates."""
+"""The tf frame of grid and pose. The searched variables are coordinates in this frame."""
 MOST_OCCUPIED: Final = 98
-"""Value of the most probable cell in a grid message, because rviz paints 99 and 100 as obstacles."""
+"""Value of the most probable cell in a grid message. rviz would paint 99 and 100 as obstacles."""
 _HEADING_VARIANCE: Final = math.pi**2 / 3
 """Variance of an angle that is uniform over the circle, published because a grid says nothing about the heading."""
 _METRES: Final = {"m": 1.0, "dm": 0.1, "cm": 0.01, "mm": 0.001, "km": 1000.0}
@@ -44,12 +44,12 @@ class Level(IntEnum):
 
 
 class Plane(NamedTuple):
-    """The plane of two searched variables, in metres if they are lengths."""
+    """The plane that two searched variables span. Lengths are in metres."""
 
     x: Dimension
     y: Dimension
     x_is_last: bool
-    """True if x is the last, fastest dimension of the posterior."""
+    """True if x is the last dimension of the posterior, whose index varies fastest."""
 
     @classmethod
     def of(cls, dimensions: Sequence[Dimension], *, square: bool = False) -> Self:
@@ -84,7 +84,7 @@ class Plane(NamedTuple):
 
 
 def has_coordinates(dimensions: Sequence[Dimension]) -> bool:
-    """Return whether two variables are searched, each a length, or a number without a unit that is not an index."""
+    """Return whether two variables are searched, each a length or a number without a unit. Indices do not count."""
     return len(dimensions) == 2 and all(
         not each.states and (each.unit in _METRES or (not each.unit and (each.offset, each.step) != (0, 1)))
         for each in dimensions
@@ -95,9 +95,9 @@ def has_coordinates(dimensions: Sequence[Dimension]) -> bool:
 
 
 def counts_message(boards: Sequence[BoardResult]) -> dict[str, Any]:
-    """Return the result words of the boards as a std_msgs/UInt32MultiArray, a row for each board.
+    """Return the result words of the boards as a std_msgs/UInt32MultiArray with a row for each board.
 
-    A row that is shorter than the longest is filled up with zeros.
+    Zeros fill each row up to the length of the longest row.
     """
     rows = [np.frombuffer(board.words, "<u4") for board in boards]
     width = max((len(row) for row in rows), default=0)
@@ -114,10 +114,10 @@ def counts_message(boards: Sequence[BoardResult]) -> dict[str, Any]:
 def grid_message(
     posterior: NDArray[np.float64], plane: Plane, stamp_ns: int, ros_version: RosVersion
 ) -> dict[str, Any]:
-    """Return a posterior as a nav_msgs/OccupancyGrid, whose cells must be square.
+    """Return a posterior as a nav_msgs/OccupancyGrid. The cells of `plane` must be square.
 
-    The value of a cell is `round(98 p / p_max)`, at index `y * width + x`. Cells are in the order of increasing
-    x and y, even if an axis has a negative step.
+    A cell of probability p has the value `round(98 p / p_max)`, at index `y * width + x`. If an axis has a negative
+    step, the grid reverses this axis, because x and y increase with the index.
     """
     cells = plane.cells(posterior)[:: -1 if plane.y.step < 0 else 1, :: -1 if plane.x.step < 0 else 1]
     data = np.rint(cells * (MOST_OCCUPIED / posterior.max())).astype(np.int8)
@@ -153,7 +153,7 @@ def pose_message(
 
 
 def moments(cells: NDArray[np.float64]) -> tuple[tuple[float, float], tuple[float, float, float]]:
-    """Return mean (row, column) and covariance (rows, both, columns) of a distribution over rows and columns."""
+    """Return mean (row, column) and covariance (row-row, row-column, column-column) of a distribution over cells."""
     rows, columns = np.arange(cells.shape[0]), np.arange(cells.shape[1])
     by_row, by_column = cells.sum(axis=1), cells.sum(axis=0)
     total = by_row.sum()
@@ -182,7 +182,7 @@ def diagnostics(
 
 
 def status(name: str, level: Level, message: str, hardware_id: str, values: Values) -> dict[str, Any]:
-    """Return a diagnostic_msgs/DiagnosticStatus; values of None are left out."""
+    """Return a diagnostic_msgs/DiagnosticStatus without the `values` that are None."""
     return {
         "level": int(level),
         "name": f"rosbayes: {name}",
@@ -195,9 +195,10 @@ def status(name: str, level: Level, message: str, hardware_id: str, values: Valu
 def decision_statuses(
     posterior: NDArray[np.float64] | None, deployment: Deployment, *, why: str, number: int, age_ms: float
 ) -> list[dict[str, Any]]:
-    """Return a status with the most probable value, for each replica.
+    """Return a DiagnosticStatus for each replica, with the replica's most probable value.
 
-    `why` is the reason why the decision is not valid, empty if it is; `age_ms` is the time since the reading's receipt.
+    `why` says why the decision is not valid. For a valid decision, it is empty. `age_ms` is the time since the
+    receipt of the reading.
     """
     replicas = deployment.machine.replicas
     rows = [None] * replicas if posterior is None else posterior.reshape(replicas, -1)

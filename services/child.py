@@ -25,11 +25,11 @@ from terminal.run_directory import LockedRunDirectory
 from terminal.signals import ENDING_SIGNALS, raise_on_signals, stopped_error
 
 RUN_DIRECTORY_VARIABLE = "BM_RUN_DIRECTORY"
-"""Environment variable with the folder of status sockets (the setting `run_directory`)."""
+"""Environment variable for the setting `run_directory`, the folder of the status sockets."""
 
 _IGNORED_BY_PYTHON: Final = (signal.SIGPIPE, signal.SIGXFSZ)
 LONGEST_LINE: Final = 1 << 20
-"""Maximum number of bytes of a line from a child; a longer one is passed on in pieces."""
+"""Maximum number of bytes of a line from a child. The parent passes a longer line on in pieces."""
 
 RESTARTS = 3
 """Maximum number of restarts of a process within the setting `restart_window`.
@@ -39,7 +39,7 @@ If the process exits once more in this time, its parent ends with an error.
 
 
 def describe_exit(code: int | None) -> str:
-    """Return a text for an exit code: the signal that killed the process, or the code itself."""
+    """Return a predicate that describes an exit code, such as `was killed by SIGTERM`."""
     if code is not None and code < 0:
         try:
             return f"was killed by {signal.Signals(-code).name}"
@@ -110,7 +110,7 @@ class _Pipe:
 
 
 class Child:
-    """A child process. The error that it reports is stored, and its lines are forwarded."""
+    """A child process. This object stores the error that the child reports, and passes the child's lines on."""
 
     def __init__(
         self,
@@ -120,7 +120,10 @@ class Child:
         directory: LockedRunDirectory | None = None,
         ends: deque[float] | None = None,
     ) -> None:
-        """Store the command; `ends` keeps the last exit times (one more than permitted restarts) and may be shared."""
+        """Store the command. `ends` keeps the times of the last exits, and several children may share it.
+
+        The maximum length of `ends` is the number of permitted restarts plus 1.
+        """
         self.name = name
         self._command = command
         # The run directory, whose lock the child holds too, so that the next run waits for its end.
@@ -195,12 +198,12 @@ class Child:
 
     @property
     def pid(self) -> int:
-        """The process id; 0 before the first start."""
+        """The process id, or 0 before the first start."""
         return self._process.pid if self._process else 0
 
     @property
     def exit_code(self) -> int | None:
-        """The exit code, negative for a signal; None before the first start and while the process runs."""
+        """The exit code, negative after a signal. It is None before the first start and while the process runs."""
         return self._process.returncode if self._process else None
 
     @property
@@ -209,7 +212,7 @@ class Child:
         return self._process is not None and self._process.returncode is None
 
     async def wait(self) -> None:
-        """Wait until the process has exited and its lines have been forwarded."""
+        """Wait until the process has exited and all its lines have been passed on."""
         if self._process is not None:
             await self._process.wait()
             # the pipes may stay open: a grandchild can hold them
@@ -217,7 +220,7 @@ class Child:
                 pipe.read(last=True)
 
     def failure(self) -> StackError:
-        """Return the exit of the process as an error, with the sentence and exit code that it reported, if any."""
+        """Return the process's exit as an error. The text is the reported error, or otherwise describes the exit code."""
         code = self.exit_code
         # the exit code of an error decides whether a restart would help, so it must not be lost
         if self._error:
@@ -225,7 +228,7 @@ class Child:
         return ReportedError(ExitCode.CHILD, f"{self.name} {describe_exit(code)}")
 
     def may_restart(self, window: float) -> bool:
-        """Count the last exit; return whether the limit of exits within `window` seconds permits another start."""
+        """Count an exit. Return whether the number of exits in the last `window` seconds permits another start."""
         now = time.monotonic()
         self.restarts += 1
         self._ends.append(now)
@@ -250,10 +253,10 @@ class Child:
 
 
 class ForkedChild(Child):
-    """A child that is forked from this process, whose loaded modules it shares, and runs a function."""
+    """A child that is forked from this process and runs a function. The child shares the modules loaded so far."""
 
     def __init__(self, name: str, run: Callable[[], int], *, ends: deque[float]) -> None:
-        """Store the function, whose result is the child's exit code; `ends` as in `Child`."""
+        """Store the function. Its result is the child's exit code. `ends` has the same meaning as in `Child`."""
         super().__init__(name, [name], ends=ends)
         self._run = run
 
@@ -282,16 +285,16 @@ class ForkedChild(Child):
 
 
 class ForkedCommand(Child):
-    """A `rosbayes` command as a child, first forked from this process, and executed anew at each restart.
+    """A `rosbayes` command as a child. The first start forks this process. Each restart executes a new interpreter.
 
-    A fork takes a few milliseconds, and a new interpreter 0.3 s, because it imports again. But a fork later in the run
-    would copy the run's state.
+    A fork takes a few milliseconds, and a new interpreter takes 0.3 s for its imports. But a fork during the run would
+    copy the state of the run.
     """
 
     def __init__(
         self, name: str, role: str, arguments: list[str], *, directory: LockedRunDirectory | None
     ) -> None:
-        """Store the name for messages, the command of the project, and its arguments."""
+        """Store the child's name for messages, the `rosbayes` command `role`, and the command's arguments."""
         super().__init__(name, [*own_command(role), *arguments], directory=directory)
         self._role = role
         self._arguments = arguments
@@ -308,7 +311,7 @@ class ForkedCommand(Child):
 
 
 async def end_all(children: Iterable[Child], stop_timeout: float) -> list[str]:
-    """Stop children within `stop_timeout` seconds, kill those still running, and return the names of the killed."""
+    """Terminate children. After `stop_timeout` seconds, kill the children that still run, and return their names."""
     children = list(children)
     running = [child for child in children if child.is_running]
     for child in running:

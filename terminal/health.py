@@ -32,11 +32,11 @@ _END_TIMEOUT = 2.0
 
 
 class NoHealthError(Exception):
-    """A status socket did not answer; the text continues a sentence that begins with the name of the process."""
+    """A process did not report its status. The message continues a sentence that begins with the process's name."""
 
 
 def status_socket(directory: str | os.PathLike[str], name: str) -> str:
-    """Return the path of a process's status socket."""
+    """Return the path of the status socket of the process `name`."""
     return os.path.join(directory, name + SUFFIX)
 
 
@@ -44,7 +44,10 @@ def status_socket(directory: str | os.PathLike[str], name: str) -> str:
 
 
 def read_status(path: str, timeout: float) -> bytes:
-    """Return the answer at a status socket; a NoHealthError after `timeout` seconds or `ANSWER_LIMIT` bytes."""
+    """Return the answer of a process at its status socket.
+
+    Raises a NoHealthError if no answer of at most `ANSWER_LIMIT` bytes arrives within `timeout` seconds.
+    """
     deadline = time.monotonic() + timeout
     data = bytearray()
     with silence_explained(path, timeout), socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as asking:
@@ -74,12 +77,12 @@ def silence_explained(path: str, timeout: float) -> Iterator[None]:
 
 
 def foreign_socket_error(path: str) -> NoHealthError:
-    """Return the error for a socket whose answer is not a status of rosbayes."""
+    """Return the error for an answer that is not the status of a rosbayes process."""
     return NoHealthError(f"is not a rosbayes process of this version, according to its answer at {path}")
 
 
 def is_ready(path: str, timeout: float) -> tuple[bool, str]:
-    """Return whether a process is ready, and the reason, or raise a NoHealthError if it gives no valid answer."""
+    """Return whether a process is ready, and why. Raises a NoHealthError if the process gives no valid answer."""
     data = read_status(path, timeout)
     try:
         status = json.loads(data)
@@ -89,7 +92,7 @@ def is_ready(path: str, timeout: float) -> tuple[bool, str]:
 
 
 def resources() -> dict[str, float]:
-    """Return the user and system time and the resident memory of this process."""
+    """Return the CPU time of this process in seconds, and its resident memory in bytes."""
     with open("/proc/self/statm", encoding="ascii") as statm:
         pages = int(statm.read().split()[1])
     return {"cpu_s": round(time.process_time(), 3), "memory_bytes": pages * os.sysconf("SC_PAGESIZE")}
@@ -144,9 +147,9 @@ def _listening(directory: str | os.PathLike[str] | None, name: str) -> Iterator[
 async def serve_health(
     directory: str | os.PathLike[str] | None, name: str, answer: Callable[[], bytes]
 ) -> AsyncIterator[None]:
-    """Answer health checks in the running event loop within the context: an answer proves that the loop is not blocked.
+    """Answer health checks within the context. The running event loop answers, which proves that it is not blocked.
 
-    `answer` returns the JSON object. Without a directory nothing is served.
+    `answer` returns the JSON object. If `directory` is None, there is no status socket.
     """
     import asyncio
 
@@ -173,7 +176,7 @@ async def serve_health(
 
 @contextlib.contextmanager
 def in_thread(serving: Callable[[], AbstractAsyncContextManager[None]]) -> Iterator[None]:
-    """Hold a context open in the event loop of another thread, for a process whose main thread blocks."""
+    """Keep a context open in the event loop of another thread, so that the main thread of the process may block."""
     import asyncio
 
     entered: Future[None] = Future()

@@ -10,7 +10,7 @@ _LONGEST: Final = 80
 
 
 def one_line(text: str) -> str:
-    r"""Return a text as one line, with everything that is not printable escaped: `\n`, `\x1b`, `\u202e`."""
+    r"""Return a text as one line. Characters that are not printable are escaped, such as `\n` and `\x1b`."""
     if text.isprintable():
         return text
     return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
@@ -22,7 +22,10 @@ def lines_of(text: str) -> str:
 
 
 def shown(value: object) -> str:
-    """Return a value for use in a sentence: quoted if it is blank or not printable, and cut to 80 characters."""
+    """Return a value as text for a sentence, cut to 80 characters.
+
+    If the text is empty, not printable, or has a space at an end, the text is quoted.
+    """
     text = str(value)
     text = text if text.isprintable() and text and text.strip() == text else repr(text)
     return text if len(text) <= _LONGEST else text[:_LONGEST] + "..."

@@ -1,4 +1,4 @@
-"""Encodings of a published message: JSON, PNG, CBOR, and CBOR with the serialised message.
+"""Encodings of a published message: JSON, PNG, CBOR, and CBOR around a ROS-serialised message.
 
 A message is encoded only once for all subscribers with the same encoding.
 """
@@ -22,7 +22,7 @@ from bridge.hub.limits import RefusedOperationError
 
 
 class Encoding(StrEnum):
-    """Encodings. If a client requests several for one topic, the last in this order applies, as in rosbridge_suite."""
+    """Encodings. If a client requests several for a topic, the hub uses the last in this order, like rosbridge_suite."""
 
     NONE = "none"
     PNG = "png"
@@ -36,7 +36,7 @@ _NONE, _PNG, _, _CBOR_RAW = ENCODINGS
 
 
 def encoding_of(requested: object) -> Encoding:
-    """Return the requested encoding, or plain JSON if it is unknown, as on the reference server."""
+    """Return the requested encoding, or `NONE` if the request is unknown. The reference server does the same."""
     return next((known for known in Encoding if known == requested), Encoding.NONE)
 
 
@@ -68,12 +68,12 @@ def as_png(payload: bytes) -> bytes:
 
 
 def json_prefix(name: str) -> bytes:
-    """Return the bytes of a publish operation before the JSON of its message, for the topic `name`."""
+    """Return the JSON of a publish operation on the topic `name`, up to the beginning of the message."""
     return b'{"op":"publish","topic":"%b","msg":' % name.encode()
 
 
 AROUND: Final = len(json_prefix("")) + 1
-"""Size in bytes of a publish operation without the name of its topic and the JSON of its message."""
+"""Size of a publish operation in bytes, without the topic's name and without the message."""
 
 
 @dataclass(eq=False, slots=True)
@@ -98,7 +98,10 @@ class OutgoingMessage:
     _payloads: dict[tuple[Encoding, str], bytes | BridgeError] = field(default_factory=dict)
 
     def payload(self, compression: Encoding, name: str) -> bytes:
-        """Return the message in one encoding, under the topic's name as a client spells it, or raise a BridgeError."""
+        """Return the encoded publish operation. `name` is the topic's name as the client spells it.
+
+        Raises a BridgeError if the message cannot be encoded, or is too large.
+        """
         # Payloads and failures are kept: each encoding is tried once, however many subscribers want it.
         payload = self._payloads.get((compression, name))
         if payload is None:

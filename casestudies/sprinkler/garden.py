@@ -1,4 +1,4 @@
-"""A simulated garden in place of a robot: rain, sprinkler and grass of each morning, drawn from the model."""
+"""A simulated garden instead of a robot. Rain, sprinkler and grass of each morning are drawn from the model."""
 
 import asyncio
 import random
@@ -26,7 +26,10 @@ def mornings(seed: int) -> Iterator[tuple[int, int, int]]:
 
 
 async def publish_mornings(uri: str, *, seed: int, rate: float, count: int | None = None) -> None:
-    """Publish the grass, for `count` mornings or until cancelled; a BridgeError if no server answers at the URI."""
+    """Publish whether the grass is wet, for `count` mornings. If `count` is None, publish until cancelled.
+
+    Raises a BridgeError if no server answers at the URI.
+    """
     from casestudies.topics import LossyPublication, connected
 
     async with connected("sprinkler-garden", "the grass was published", uri) as (ros, readiness):

@@ -20,13 +20,14 @@ def program(
     """Program the board whose registers are at `endpoint`, and return the image hash that the board then reports.
 
     The file and the board's register map are checked before the board is changed. Connecting, transferring the file
-    and loading the machine may each take `timeout` seconds. If this host has a link to the board, `token` is that of
-    the link's greeting.
+    and loading the machine may each take `timeout` seconds. If this host has a link to the board, `token` is the token
+    in the link's greeting.
 
     Raises:
         ImageError: The file is missing, damaged, or for another register map.
+            It is also raised if the board refuses the file.
         GreetingMismatchError: The board has another register map.
-        HeldError: A host holds the board, or another loader is programming it.
+        HeldError: Another host holds the board, or another loader is programming it.
         LinkError: The board is unreachable, or the link is broken.
     """
     where = parse_endpoint(endpoint) if isinstance(endpoint, str) else endpoint

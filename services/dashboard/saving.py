@@ -1,4 +1,4 @@
-"""The kept frames as files: a NumPy archive, and a table with a column for each cell."""
+"""Files of the frames that the dashboard keeps: a NumPy archive, and a CSV table with a column for each cell."""
 
 import csv
 import io
@@ -37,7 +37,7 @@ def archive(frames: Sequence[KeptFrame], axes: Sequence[Axis]) -> bytes:
 
 
 def table(frames: Sequence[KeptFrame]) -> bytes:
-    """Return at least one frame as a CSV table, with each frame's most probable cell and all probabilities."""
+    """Return at least one frame as a CSV table. A row has the frame's most probable cell and all its probabilities."""
     labels, first = frames[0].labels, frames[0].values
     cells = cell_names(labels, first.shape) if first is not None else ()
     file = io.StringIO(newline="")

@@ -27,7 +27,7 @@ from toolchain.outputs.mif import LENGTH, table_length
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """Resources of a machine on an FPGA, whose PCIe controller is a hard block and needs no logic."""
+    """Estimated resources of a machine on an FPGA. The PCIe controller is a hard block, so it needs no logic."""
 
     device: Device
     logic: Logic
@@ -35,7 +35,7 @@ class Estimate:
 
     @property
     def alms(self) -> float:
-        """All ALMs: those of memory LABs, and those for look-up tables or for registers, whichever are more."""
+        """Number of ALMs: those for memory, plus the larger of the numbers for look-up tables and for registers."""
         logic = max(self.logic.alms, self.logic.registers / self.device.registers_per_alm)
         return logic + self.memories.alms
 
@@ -51,12 +51,12 @@ class Estimate:
 
     @property
     def fits(self) -> bool:
-        """True if the machine can be placed and routed."""
+        """True if the usable resources of the device are sufficient for the machine."""
         return self.why_not == ""
 
     @property
     def why_not(self) -> str:
-        """The insufficient resource, as a clause; empty if the machine fits."""
+        """A clause that names the insufficient resource. It is empty if the machine fits."""
         usable = self.device.usable
         if self.memories.blocks > usable * self.device.blocks:
             return f"it takes {self.memories.blocks:,} memory blocks, and there are {self.device.blocks:,}"
@@ -71,10 +71,10 @@ class Estimate:
 def estimate(
     parameters: BM1Parameters, device: Device, *, table_length: int = LENGTH, inputs: int = 0
 ) -> Estimate:
-    """Return the resources of a machine on a device, or raise a BuildError if it exists only in emulation.
+    """Return the resources of a machine on a device. Raises a BuildError if the machine exists only in emulation.
 
-    `inputs` is the number of input words of the board's registers, if it is more than the machine needs. Results take
-    no memory, because they are counters.
+    If the board's registers have more input words than the machine needs, `inputs` is their number. Results take no
+    memory, because they are counters.
     """
     return Estimate(
         device=device,
@@ -110,7 +110,7 @@ def most_replicas(
     table_length: int = LENGTH,
     interface: tuple[int, int] | None = None,
 ) -> tuple[int, str]:
-    """Return how many replicas of a machine fit a board (0 if none does), and why no more fit, as a clause."""
+    """Return how many replicas of a machine fit a board, at least 0, and a clause that says why no more fit."""
 
     def why_not(replicas: int) -> str:
         return _why_not(replace(board, replicas=replicas), device, table_length, interface)
@@ -128,7 +128,7 @@ def boards_needed(
     table_length: int = LENGTH,
     interface: tuple[int, int] | None = None,
 ) -> tuple[int, str]:
-    """Return the minimum number of boards for a machine, and a sentence that says why.
+    """Return the minimum number of boards for a machine, and sentences that explain the number.
 
     Raises:
         BuildError: Not even one line fits a board.
@@ -168,9 +168,9 @@ NET_CAPACITANCE: Final = 1.2e-12
 """Assumed capacitance of a net with its routing, in farads."""
 TOGGLE_J: Final = 0.5 * NET_CAPACITANCE * CORE_VOLTAGE**2
 CLOCK_J: Final = 0.05e-12
-"""Assumed energy for the clock of a register per cycle, in joules."""
+"""Assumed energy that the clock of one register takes in a cycle, in joules."""
 COMPARATOR_ACTIVITY: Final = 0.25
-"""Assumed toggles per cycle of a look-up table or a carry inside a comparator."""
+"""Assumed number of toggles per cycle of each look-up table and each carry inside a comparator."""
 STATIC_W: Final = 2.0
 """Assumed leakage power of an FPGA, in watts."""
 
@@ -203,12 +203,12 @@ class Energy:
     static_w: float
 
     def frame_j(self, cycles: float, clock_hz: float) -> tuple[float, float]:
-        """Return the energy of a frame in joules, for toggles and for leakage."""
+        """Return the energy of a frame in joules: first for toggles and clocks, then for leakage."""
         return cycles * self.cycle_j, cycles / clock_hz * self.static_w
 
 
 def energy(machines: Sequence[BM1Machine], readings: Readings) -> Energy:
-    """Return the energy model for all boards; activity is averaged over the first 50 frames of readings."""
+    """Return the energy model for all boards. Toggles are averaged over the first 50 frames of `readings`."""
     toggles = clocked = 0.0
     ends = np.cumsum([machine.parameters.lines for machine in machines]).tolist()
     for machine, end in zip(machines, ends, strict=True):

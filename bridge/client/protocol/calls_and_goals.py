@@ -65,7 +65,7 @@ class _Pending:
 
 
 class PendingCalls(_Pending):
-    """Calls of this client that have no answer yet."""
+    """Service calls of this client that have no answer yet."""
 
     def send(self, service: str, args: Mapping[str, Any]) -> str:
         """Call a service, and return the id that the event `CallAnswered` will have.
@@ -82,7 +82,7 @@ class PendingCalls(_Pending):
         return call
 
     def receive(self, operation: dict[str, Any], data: bytes) -> CallAnswered | UnusableReceived | None:
-        """Handle an answer; return None if no call waits for it."""
+        """Handle a service_response. Return the event for the program, or None if no call waits for the response."""
         call = operation.get("id")
         if not isinstance(call, str):
             return UnusableReceived(f"a service_response without the id of a call arrived: {excerpt(data)}")
@@ -96,10 +96,10 @@ class PendingCalls(_Pending):
 
 
 class PendingGoals(_Pending):
-    """Goals of this client that have not ended."""
+    """Goals that this client has sent and that have not ended."""
 
     def send(self, action: str, type_name: str, goal: Mapping[str, Any], *, feedback: bool) -> str:
-        """Send a goal (see `bridge.client.Ros.send_goal`), and return the id by which events name it."""
+        """Send a goal, and return the id that the goal has in events (see `bridge.client.Ros.send_goal`)."""
         check_name(action)
         if len(self._names) >= MAX_GOALS:
             raise SlowPeerError(f"{MAX_GOALS} goals are active, so none was sent to {action}")
@@ -194,7 +194,7 @@ class _Served:
 
 
 class ServedServices(_Served):
-    """This client's services, and their unanswered requests. A request has a ticket, a number that is never reused."""
+    """This client's services, and their unanswered requests. Each request has a unique number, the ticket."""
 
     kind = "service"
 
@@ -235,7 +235,7 @@ class ServedServices(_Served):
         del self._requests[ticket]
 
     def receive(self, operation: dict[str, Any], data: bytes) -> ServiceRequested | UnusableReceived | None:
-        """Handle a request; return None if it was refused here."""
+        """Handle a call_service. Return the event for the program, or None if this client refused the request."""
         service = operation.get("service")
         args = operation.get("args")
         wire_id = operation.get("id")
@@ -258,7 +258,7 @@ class ServedServices(_Served):
 
 
 class ServedActions(_Served):
-    """The actions that this client offers, and their goals in execution, by the goals' ids on the wire."""
+    """The actions that this client offers, and the goals that it executes. Goals have the ids of the wire protocol."""
 
     kind = "action"
 
