@@ -2,10 +2,11 @@
 
 These are the rules for the variables in `deployment.toml`: a name with `.` or `[` is a path
 (`pose.position.x`, `ranges[3]`). A bare name is searched in the whole message, depth first, except inside
-arrays. It may occur only once, and its path in the first message is reused for later ones.
+arrays. A message may have only one field with the name. The path to the field in the first message is used for
+all later messages.
 
-An index reaches into every form of an array: a list, a NumPy array, bytes, and the base64 text of `uint8[]`
-in JSON.
+An index selects an element of an array in every form: a list, a NumPy array, bytes, and the base64 text of
+`uint8[]` in JSON.
 """
 
 import base64
@@ -16,7 +17,7 @@ from typing import Any, Final
 from bridge.errors import FieldAmbiguousError, FieldMissingError, PathError
 
 Place = tuple[str | int, ...]
-"""Place in a message: keys of objects and indices of arrays, the outermost first."""
+"""Place of a field in a message: the keys of objects and the indices of arrays on the way to it, outermost first."""
 
 MAX_LISTED: Final = 24
 """Maximum number of fields listed in an error."""
@@ -89,7 +90,7 @@ class Field:
         return True, value
 
     def missing(self, message: dict[str, Any]) -> FieldMissingError:
-        """Return the error for a message without the variable; it lists the message's fields."""
+        """Return the error for a message that lacks the variable. The error says what the message has instead."""
         return FieldMissingError(f"the message has no field {self.name!r}{self._reason(message)}")
 
     def _reason(self, message: dict[str, Any]) -> str:
@@ -133,10 +134,10 @@ def all_missing(fields: Sequence[Field], message: dict[str, Any]) -> FieldMissin
 
 
 def parse_path(path: str) -> Place:
-    """Parse a path: names joined by dots, and whole numbers from 0 in brackets.
+    """Parse a path: names joined by dots, and array indices (from 0) in brackets.
 
     Raises:
-        PathError: The path is malformed; the sentence names the position.
+        PathError: The path is empty or malformed. If it is malformed, the error names the position.
     """
     steps: list[str | int] = []
     at = 0
@@ -167,7 +168,7 @@ def format_place(place: Place) -> str:
 
 
 def find_places(message: dict[str, Any], name: str) -> list[Place]:
-    """Return the places of all fields with a name, depth first in the order of the message, except inside arrays."""
+    """Return the places of all fields with a name, depth first in the order of the message. Arrays are not searched."""
     # A stack instead of recursion, because messages may be deeply nested; reversed, so that places are in the order of
     # the message.
     places: list[Place] = []

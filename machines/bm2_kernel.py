@@ -1,4 +1,4 @@
-"""The common base of the kernels of a BM2, and the checks of their arguments."""
+"""The base class of the BM2 kernels, and the check of the values that start a frame."""
 
 from abc import ABC, abstractmethod
 from functools import cache
@@ -14,9 +14,9 @@ from machines.rng import Words, random_numbers, sequencer_seed
 
 
 class BM2Kernel(ABC):
-    """A running machine: one chain of samples (thesis 2.1.3).
+    """A kernel that runs a BM2: one chain of samples (thesis 2.1.3).
 
-    After the same calls, all kernels have the same results and state, bit for bit.
+    All subclasses are equal bit for bit: equal calls lead to equal results and an equal state.
     """
 
     def __init__(self, machine: BM2Machine) -> None:
@@ -58,7 +58,7 @@ class BM2Kernel(ABC):
 
     @property
     def results(self) -> npt.NDArray[np.uint32]:
-        """A copy of the result words, uint32[result_words]: each variable's histogram, then that of the joint."""
+        """A copy of the result words, uint32[result_words]: each variable's histogram, then the joint histogram."""
         return self._results.astype(np.uint32)
 
     @property
@@ -69,7 +69,7 @@ class BM2Kernel(ABC):
     @property
     @abstractmethod
     def stream(self) -> npt.NDArray[np.uint32]:
-        """A copy of the stream's buffer: uint32[samples since the last start or resume, state_words]."""
+        """A copy of the stream's buffer, uint32[samples, state_words]: the samples since the last start or resume."""
 
     def reset(self) -> None:
         """Set state, results and cycles to 0, and restart the generators from bank 0."""
@@ -111,7 +111,10 @@ class BM2Kernel(ABC):
         return self._continue(pause_at)
 
     def step(self, pause_at: int = 0) -> BM2StopReason:
-        """Continue after a pause; raise a StartError if the frame is not paused or `pause_at` is not after `cycles`."""
+        """Continue after a pause. The machine pauses again after cycle `pause_at`, unless `pause_at` is 0.
+
+        Raises a StartError if the frame is not paused, or if cycle `pause_at` has already passed.
+        """
         if self.reason is not BM2StopReason.PAUSED:
             raise StartError(
                 f"The machine is not paused: it has stopped with reason {self.reason.name.lower()}."

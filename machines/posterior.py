@@ -1,4 +1,4 @@
-"""Posteriors from the counts of all boards of a model, and `posterior`, which first runs the machines."""
+"""Posteriors from the counts of all boards of a model. The function `posterior` also runs the machines."""
 
 from collections.abc import Sequence, Sized
 from typing import TypeAlias, cast
@@ -40,7 +40,10 @@ def joint_posterior(
 def posterior_of_lines(
     counts: npt.NDArray[np.uint32], lines: Sequence[int], cycles: Sequence[int]
 ) -> npt.NDArray[np.float64] | None:
-    """Return the `joint_posterior` of concatenated counts, uint32[all lines], or raise its MachineError."""
+    """Return the same posterior as `joint_posterior`, from the concatenated counts of all boards, uint32[all lines].
+
+    `lines` and `cycles` have a number for each board. Raises a MachineError if a board has counts without cycles.
+    """
     if min(cycles) <= 0:
         end = 0
         for board, (own, run) in enumerate(zip(lines, cycles, strict=True)):
@@ -56,10 +59,10 @@ def posterior_of_lines(
 def posteriors_of_replicas(
     counts: Sequence[npt.NDArray[np.uint32]], cycles: Sequence[Sequence[int]]
 ) -> npt.NDArray[np.float64] | None:
-    """Return the `joint_posterior` of each replica, float64[replicas, all lines], or None if no replica has one.
+    """Return each replica's `joint_posterior`, float64[replicas, all lines], or None if no replica has a posterior.
 
-    Each board has counts, uint32[replicas, lines], and the cycles of each replica. A replica without a posterior has
-    zeros, so that the others keep their places.
+    Each board has counts, uint32[replicas, lines], and a number of cycles for each replica. The row of a replica
+    without a posterior contains zeros.
     """
     joints = [
         joint_posterior([own[replica] for own in counts], [own[replica] for own in cycles])
@@ -72,7 +75,7 @@ def posteriors_of_replicas(
 
 
 Reading: TypeAlias = int | Sequence[int] | npt.NDArray[np.integer] | None
-"""Reading of a sensor column: an address, an address or code per line (`sensor_mode`), or None if missing."""
+"""Reading of a sensor column: an address, or None if missing. With inputs per cell, an address or code per line."""
 
 
 def posterior(

@@ -1,4 +1,4 @@
-"""Endpoints of boards and services, `unix:/path` or `tcp://host:port`, and their sockets."""
+"""Endpoints of boards and services (`unix:/path` or `tcp://host:port`), and functions that open their sockets."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Endpoint:
 
     @property
     def programming(self) -> Endpoint:
-        """The programming port of a board: `board0.program.sock` next to `board0.sock`, or the next TCP port."""
+        """The endpoint for programming a board: `board0.program.sock` for `board0.sock`, or the next TCP port."""
         if self.path:
             path = Path(self.path)
             return Endpoint(path=str(path.with_name(f"{path.stem}.program{path.suffix}")))
@@ -63,7 +63,7 @@ class Endpoint:
 
 
 def parse_endpoint(text: str) -> Endpoint:
-    """Parse `unix:/path` or `tcp://host:port`, or raise an EndpointError."""
+    """Parse `unix:/path` or `tcp://host:port`. Raises an EndpointError if the text is not an endpoint."""
     if text.startswith("unix:"):
         endpoint = Endpoint(path=text.removeprefix("unix:"))
         if not endpoint.path.startswith("/"):
@@ -95,7 +95,10 @@ def parse_endpoint(text: str) -> Endpoint:
 
 
 def listen(endpoint: Endpoint) -> socket.socket:
-    """Return a listening socket, or raise an EndpointError; a unix socket has mode 0600 and replaces a stale one."""
+    """Return a listening socket. Raises an EndpointError if the endpoint cannot be used.
+
+    A unix socket has mode 0600. If a process that has ended left a socket file at the path, the file is replaced.
+    """
     try:
         if not endpoint.path:
             family = socket.AF_INET6 if ":" in endpoint.host else socket.AF_INET
@@ -131,7 +134,7 @@ def _listen_privately(path: str) -> socket.socket:
 
 
 def is_served(path: str) -> bool:
-    """Return whether a process listens at the path of a unix socket, even if it does not answer."""
+    """Return whether a process listens at the path of a unix socket. The process need not answer."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
         probe.setblocking(False)
         try:
@@ -191,7 +194,7 @@ def no_delay(connection: socket.socket) -> None:
 
 
 def remove_listener(endpoint: Endpoint, server: socket.socket) -> None:
-    """Close a listening socket and remove its file."""
+    """Close a listening socket. If it is a unix socket, also remove its file."""
     server.close()
     if endpoint.path:
         with suppress(OSError):

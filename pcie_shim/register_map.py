@@ -39,7 +39,7 @@ class ErrorCode(IntEnum):
 
 
 class Block(int):
-    """The address in bytes of a register, an array of registers or a memory, which has `words` 32-bit words."""
+    """The address in bytes of a register, an array of registers or a memory. The block has `words` 32-bit words."""
 
     words: int
     writable: bool

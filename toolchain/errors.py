@@ -1,4 +1,4 @@
-"""Errors of the toolchain, each one sentence for the user."""
+"""Errors of the toolchain. The text of each error is one sentence for the user."""
 
 from pathlib import Path
 from typing import ClassVar
@@ -17,7 +17,10 @@ class ToolchainError(Exception):
         line: int | None = None,
         place: tuple[str | int, ...] = (),
     ) -> None:
-        """Prefix the sentence with file and line; `place` is a key such as `("variable", 2, "bits")`."""
+        """Prefix the sentence with the path and line of a file.
+
+        `place` is the position of the wrong key in the file, for example `("variable", 2, "bits")`.
+        """
         where = f"{path}" + ("" if line is None else f", line {line}")
         super().__init__(f"{where}: {sentence}" if where else sentence)
         self.path = path
@@ -26,14 +29,14 @@ class ToolchainError(Exception):
 
 
 class ModelError(ToolchainError):
-    """A model that a machine cannot compute: wrong shapes, names, probabilities or parameters."""
+    """A machine cannot compute a model, because its shapes, names, probabilities or parameters are wrong."""
 
 
 class NotFusionError(ModelError):
-    """A question that a BM1 cannot compute, because two known symbols depend on each other."""
+    """A BM1 cannot answer a question, because two known symbols are not independent given the searched symbols."""
 
     def __init__(self, why: str, advice: str) -> None:
-        """Compose the sentence; `why` names the two symbols and the path between them."""
+        """Join `why` and `advice` to one sentence. `why` names the two symbols and the path between them."""
         super().__init__(f"{why}; {advice}")
         self.why = why
 
@@ -59,11 +62,11 @@ class DeploymentVersionError(DeploymentError):
 
 
 class DamagedDeploymentError(DeploymentError):
-    """A file of the deployment has changed since the build: its hash is not the recorded one."""
+    """A file of the deployment has changed since the build: the hash of the file differs from the recorded hash."""
 
 
 class ReadingError(ToolchainError):
-    """A reading cannot become an address of its column."""
+    """A reading cannot be converted to an address of its sensor column."""
 
     exit_code: ClassVar[int] = 4
 
@@ -73,11 +76,11 @@ class NotANumberError(ReadingError):
 
 
 class ValueOutOfRangeError(ReadingError):
-    """A reading is a number outside the range of its variable, with `on_range = error`."""
+    """A reading is outside the range of its variable, and the variable has `on_range = error`."""
 
 
 class ReadingMissingError(ReadingError):
-    """A required reading is missing (`on_missing = error`)."""
+    """A reading is missing, and its variable has `on_missing = error`."""
 
 
 def counted(number: int, noun: str) -> str:

@@ -1,7 +1,7 @@
 """Access control: tokens, origins of web pages, and the certificate that the hub presents.
 
-A token arrives in the header `Authorization: Bearer TOKEN`. Browsers cannot set that header; they offer the
-subprotocols `rosbridge` and `bearer.TOKEN`, and the hub chooses the first, so the token is not sent back.
+A token arrives in the header `Authorization: Bearer TOKEN`. Browsers cannot set this header. They offer the
+subprotocols `rosbridge` and `bearer.TOKEN` instead. The hub chooses `rosbridge`, so it does not send the token back.
 Tokens are compared in constant time and never appear in a log, an error or a `repr`.
 """
 
@@ -68,9 +68,9 @@ class AccessPolicy:
     def refusal(self, request: Request, *, loopback: bool) -> HTTPStatus | None:
         """Return the HTTP status with which to refuse a request, or None to admit it.
 
-        On a loopback address, the request's host must be this machine or the host of an allowed page. A web
-        page that reaches the hub under another name has made that name resolve to this machine (DNS
-        rebinding).
+        If the hub listens on a loopback address (`loopback`), the request's `Host` must be this machine or the host of
+        an allowed web page. Another `Host` is a sign of DNS rebinding: a web page has made its own name resolve to
+        this machine.
         """
         if loopback and not self._is_for_this_machine(request):
             return HTTPStatus.FORBIDDEN

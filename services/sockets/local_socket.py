@@ -1,7 +1,7 @@
 """Local sockets between services: length-prefixed MessagePack records, and the handshake.
 
-A framed record is its length in four bytes (little-endian), followed by that many bytes of MessagePack. The core does
-not perform I/O; `RecordProtocol` connects it to asyncio.
+A framed record begins with four bytes (little-endian) that give the number of bytes of MessagePack after them.
+`RecordSplitter` decodes records and performs no I/O. `RecordProtocol` connects it to asyncio.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from services.errors import LocalSocketError, OtherPeerError
 from services.sockets.records import VERSION, AnyRecord, Hello, Record
 
 MAX_RECORD = 4 * 1024 * 1024
-"""Maximum size of a record in bytes, with ample room for 64 boards of 4096 counts."""
+"""Maximum size of a record in bytes. The results of 64 boards with 4096 counts each take about 1 MiB."""
 
 _LENGTH = struct.Struct("<I")
 _encoder = msgspec.msgpack.Encoder()
@@ -44,7 +44,10 @@ class RecordSplitter:
         self._pending = bytearray()
 
     def feed(self, data: bytes) -> list[AnyRecord]:
-        """Return the records that `data` completes, in order; raise a LocalSocketError if bytes are not a record."""
+        """Add received bytes, and return the records that are now complete, in order.
+
+        Raises a LocalSocketError if the bytes are not a record, or if a record is larger than `MAX_RECORD`.
+        """
         pending = self._pending
         pending += data
         records: list[AnyRecord] = []
@@ -77,7 +80,7 @@ def own_hello(role: str, deployment_hash: str) -> Hello:
 
 
 def check_hello(record: AnyRecord, expected_role: str, deployment_hash: str, where: str) -> None:
-    """Raise an OtherPeerError for a peer of another role, version or deployment."""
+    """Raise an OtherPeerError unless a peer's first record is a `Hello` with this role, version and deployment."""
     if not isinstance(record, Hello):
         raise OtherPeerError(
             f"{where}: the peer did not greet (a {type(record).__name__} came first); is it a {expected_role}?"
@@ -98,7 +101,7 @@ def check_hello(record: AnyRecord, expected_role: str, deployment_hash: str, whe
 
 
 class RecordProtocol(asyncio.Protocol):
-    """A local connection in asyncio; records go to a callback, without a task in between."""
+    """The asyncio protocol of a local connection. It passes each received record to a callback, without a task."""
 
     def __init__(
         self,
@@ -143,11 +146,11 @@ class RecordProtocol(asyncio.Protocol):
 
     @property
     def backlog(self) -> int:
-        """Number of written bytes that the peer has not read yet."""
+        """Number of written bytes that the socket has not accepted yet."""
         return 0 if self._transport is None else self._transport.get_write_buffer_size()
 
     def send(self, record: Record) -> bool:
-        """Write a record; return whether the connection is open."""
+        """Write a record and return True, or return False if the connection is closed."""
         if self._transport is None or self._transport.is_closing():
             return False
         self._transport.write(encode_record(record))
@@ -160,7 +163,7 @@ class RecordProtocol(asyncio.Protocol):
 
 
 async def open_connection(endpoint: Endpoint, make: Callable[[], RecordProtocol]) -> RecordProtocol:
-    """Connect once, or raise the OSError of the socket."""
+    """Connect to an endpoint, with one attempt. Raises an OSError if the attempt fails."""
     loop = asyncio.get_running_loop()
     if endpoint.path:
         _, protocol = await loop.create_unix_connection(make, endpoint.path)

@@ -36,9 +36,9 @@ class ColumnLoss:
     bits: int
     """Number of address bits."""
     values: int
-    """Number of addresses that are values of the variable."""
+    """Number of addresses that stand for a value of the variable."""
     mass: float
-    """Share of P(S, K) in cells with code 0: the probability that a reading selects code 0 on the true line."""
+    """Sum of P(S, K) over the cells with code 0: the probability that a reading selects code 0 on the true line."""
     kl_bits: float
     """KL(Q(S | k) || P(S | k)) in bits, averaged over the reading k of this column.
 
@@ -46,7 +46,7 @@ class ColumnLoss:
     reading k. The opposite divergence, KL(P || Q), would be infinite if a code of a tail became 0.
     """
     dead_values: int
-    """Number of values with a probability above 0 that have code 0 on every line."""
+    """Number of values that have a probability above 0, but code 0 on every line."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,20 +60,20 @@ class VanishedFloor:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Quantised:
-    """The codes of a model for all lines, before they are divided among boards."""
+    """The codes of a model for all lines, before the lines are divided among boards."""
 
     prior: NDArray[np.uint16]
-    """uint16[rows, lines]: a single row or, if a variable selects the prior, a row for each of its addresses. Then the
-    last row is the prior without a selection, and rows of addresses that stand for no value contain 0.
+    """uint16[rows, lines], with one row. If a variable selects the prior, there is one row for each of its addresses:
+    the last row is the prior without a selection, and rows of addresses that stand for no value contain 0.
     """
     tables: tuple[NDArray[np.uint16], ...]
-    """uint16[2**bits, lines] per known variable. The rows of addresses without a value contain 0; the last row, for
-    missing readings, contains all-ones codes. No tables with `SensorMode.THRESHOLD`.
+    """uint16[2**bits, lines] per known variable. Rows of addresses that stand for no value contain 0. The last row is
+    for missing readings, and contains all-ones codes. With `SensorMode.THRESHOLD`, there are no tables.
     """
     losses: tuple[ColumnLoss, ...]
-    """The loss of the prior, and one per known variable."""
+    """The loss of the prior, and then the loss of each table in `tables`."""
     floors: tuple[VanishedFloor, ...]
-    """The outlier floors (`floor` of a distribution) that are too low for the codes."""
+    """The outlier floors (`floor` of a distribution) that are so low that they become code 0."""
     warnings: tuple[str, ...]
     """Warnings for the user, one sentence each."""
 
@@ -85,10 +85,10 @@ def quantise(
     scale: Scale = Scale.ADDRESS,
     sensor_mode: SensorMode = SensorMode.COLUMN,
 ) -> Quantised:
-    """Return the codes of a model with `prob_bits` bits (1 to 16), and the quantisation loss.
+    """Convert the probabilities of a model to codes of `prob_bits` bits (1 to 16), and compute the quantisation loss.
 
-    `scale` is the part of a table (a row, or all of it) that is first divided by its maximum. It cannot be `address` if
-    cells have their own readings.
+    `scale` says whether each row, the whole table or nothing is first divided by its maximum. If each cell has its own
+    reading, the rows must not be divided (`Scale.ADDRESS`).
     """
     prior = model.prior_distribution
     prior_codes, prior_loss = _quantised_prior(model, prob_bits, scale)

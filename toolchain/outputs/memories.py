@@ -31,7 +31,7 @@ _ROWS_AT_ONCE: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class Memory:
-    """A memory of a board, or a memory shared by all boards."""
+    """A memory of one board, or a memory that is equal on all boards."""
 
     name: str
     """The name of its MIF."""
@@ -40,11 +40,11 @@ class Memory:
     depth: int
     """The number of words."""
     words: Callable[[], Iterable[int]]
-    """A function that returns every word, from address 0."""
+    """A function that returns all words in the order of their addresses."""
     comments: tuple[str, ...]
-    """Comment lines for the beginning of the file."""
+    """Comment lines at the beginning of the MIF."""
     board: int | None = None
-    """The board that has this memory, or None if all boards have the same."""
+    """Number of the board that has this memory, or None if the memory is equal on all boards."""
     section: str = ""
     """The section of the programming file that contains the memory's codes.
 
@@ -57,7 +57,7 @@ class Memory:
 
 
 def memories(deployment: Deployment, images: Sequence[Image]) -> tuple[Memory, ...]:
-    """Return the memories of a deployment's machine, board by board and then the shared ones.
+    """Return the memories of each board, and the memories that are equal on all boards.
 
     Generators that exist only in emulation (`rng = ideal`) have no memories.
     """
@@ -82,12 +82,12 @@ def memories(deployment: Deployment, images: Sequence[Image]) -> tuple[Memory, .
 
 
 def column_name(board: int, column: int, sensors: int) -> str:
-    """Return the file name of a board's column, whose number counts from 1 and is padded to the width of `sensors`."""
+    """Return the file name of a column's MIF. `column` counts from 1, and is padded to as many digits as `sensors`."""
     return f"board{board}_column{column:0{len(str(sensors))}d}.mif"
 
 
 def seed_words(machine: BM1Machine | BM2Machine) -> NDArray[np.uint64]:
-    """Return the seed of every generator: uint64[banks, columns], [banks, lines, columns] or [banks, CDEs]."""
+    """Return the seeds of all generators in all banks: uint64[banks, *machine.parameters.generator_shape]."""
     parameters = machine.parameters
     if parameters.rng in POLYNOMIALS:  # all banks at once
         every = np.stack([generator_numbers(parameters, bank) for bank in range(parameters.rng_banks)])
@@ -97,14 +97,14 @@ def seed_words(machine: BM1Machine | BM2Machine) -> NDArray[np.uint64]:
 
 
 def seed_width(machine: BM1Machine | BM2Machine) -> int:
-    """Return the number of bits in a seed, which is an LFSR's state, or an index into the table of random numbers."""
+    """Return the number of bits in a seed. A seed is an LFSR's state, or an index into the table of random numbers."""
     if machine.rng_table is not None:
         return max(1, (machine.rng_table.size - 1).bit_length())
     return machine.parameters.rng.lfsr_bits or 64
 
 
 def packed_words(codes: NDArray[np.uint16], prob_bits: int) -> Iterator[int]:
-    """Yield a word per row of uint16[rows, lines]: the code of line 0 in the lowest bits, `prob_bits` each."""
+    """Yield one word per row of `codes`, uint16[rows, lines]. Each code has `prob_bits` bits; line 0 is lowest."""
     weights = np.arange(prob_bits - 1, -1, -1, dtype=np.uint16)
     for start in range(0, len(codes), _ROWS_AT_ONCE):
         rows = codes[start : start + _ROWS_AT_ONCE, ::-1]
@@ -121,7 +121,7 @@ def packed_words(codes: NDArray[np.uint16], prob_bits: int) -> Iterator[int]:
 
 
 def unpacked_codes(words: Sequence[int], prob_bits: int, count: int) -> NDArray[np.uint32]:
-    """Return `count` codes from each word, uint32[words, count]; the inverse of `packed_words`."""
+    """Unpack `count` codes from each word to uint32[words, count]. This is the inverse of `packed_words`."""
     size = -(-count * prob_bits // 8)
     data = np.frombuffer(b"".join(word.to_bytes(size, "little") for word in words), np.uint8)
     found = np.empty((len(words), count), np.uint32)
@@ -212,7 +212,7 @@ def _seeds(machine: BM1Machine | BM2Machine, prefix: str, address: str) -> list[
 
 
 def generators(parameters: BM1Parameters | BM2Parameters) -> int:
-    """Return the number of generators of a board: one per column, per cell or per CDE."""
+    """Return the number of generators on a board. Each column, each cell or each CDE has one generator."""
     return math.prod(parameters.generator_shape)
 
 
