@@ -1,4 +1,4 @@
-"""The data of a BM1: its tables, the inputs of a frame, and its stop reasons."""
+"""The data of a BM1: its tables, the inputs of a frame, and the reasons why it stops."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
@@ -16,14 +16,14 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
 class MachineContents:
-    """Parameters and tables of a machine; two are equal if their contents are equal."""
+    """Parameters and tables of a machine. Two objects are equal if their parameters and tables are equal."""
 
     __slots__: tuple[str, ...] = ()
     parameters: Any
 
     @property
     def arrays(self) -> tuple[npt.NDArray[Any], ...]:
-        """The arrays, in the order of the programming file."""
+        """All arrays of the machine, in the order of the programming file."""
         contents = [getattr(self, name) for name in self.__slots__ if name != "parameters"]
         every = chain.from_iterable(each if isinstance(each, tuple) else (each,) for each in contents)
         return tuple(array for array in every if array is not None)
@@ -96,14 +96,14 @@ class BM1Machine(MachineContents):
 
 
 SHORTEST_SLICE: Final = 256
-"""Minimum end of the first slice, in cycles. Each later slice ends at twice the cycle at which the one before ended."""
+"""Minimum length of the first slice, in cycles. Each later slice ends at twice the end of the previous slice."""
 
 
 def first_slice(target_count: int) -> int:
-    """Return the end of a frame's first slice: the smallest 256 * 2^k that is at least twice the target.
+    """Return the cycle at which a frame's first slice ends: the smallest 256 * 2^k that is at least twice the target.
 
-    A line needs at least as many cycles as the target, and twice as many if it counts in every other cycle.
-    An earlier end would cost every board a useless doorbell and answer.
+    A line needs at least `target_count` cycles to reach the target, and twice as many if it counts in every other
+    cycle. A shorter slice would cost each board a useless doorbell and answer.
     """
     end = SHORTEST_SLICE
     while end < 2 * target_count:
@@ -119,11 +119,11 @@ class StopReason(IntEnum):
     OVERFLOW = 1
     """A counter reached the target count."""
     MAX_CYCLES = 2
-    """The frame's last cycle was run without an overflow."""
+    """The machine ran to the frame's last cycle (`max_cycles`), and no counter reached the target count."""
     SLICE = 3
-    """The slice's last cycle (`run_until`) was run; the frame can continue."""
+    """The machine ran to the slice's last cycle (`run_until`). The frame can continue."""
     IMPOSSIBLE = 4
-    """No line can count for these addresses (each has a code 0), so the machine did not run."""
+    """The machine did not run: each line has a code 0 at the given addresses, so no line can count."""
 
 
 _JOINT_ORDER: Final = (StopReason.OVERFLOW, StopReason.MAX_CYCLES, StopReason.IMPOSSIBLE)
@@ -131,10 +131,10 @@ _SLICE: Final = StopReason.SLICE
 
 
 def joint_reason(reasons: Sequence[StopReason], halted: Collection[int] = ()) -> StopReason:
-    """Return one stop reason for several replicas.
+    """Return the common stop reason of several replicas. `halted` are the replicas that must not continue.
 
-    It is `SLICE` while a replica that is not halted can continue; otherwise it is the first of `OVERFLOW`,
-    `MAX_CYCLES` and `IMPOSSIBLE` that any replica has.
+    If a replica that is not in `halted` stopped at its slice's end, the reason is `SLICE`. Otherwise it is the first
+    of `OVERFLOW`, `MAX_CYCLES` and `IMPOSSIBLE` that any replica has, or `NONE`.
     """
     if _SLICE in reasons and any(
         reason is _SLICE and replica not in halted for replica, reason in enumerate(reasons)
@@ -204,7 +204,7 @@ def addressed_codes(machine: BM1Machine, start: Start) -> npt.NDArray[np.uint16]
 def checked_codes(
     name: str, given: npt.NDArray[np.uint16], shape: tuple[int, ...], prob_bits: int, lowest: int = 0
 ) -> npt.NDArray[np.uint16]:
-    """Return `given` as a read-only uint16 array, after checking its shape and its codes."""
+    """Return `given` as a read-only uint16 array, or raise a ParameterError if its shape or a code is wrong."""
     array = np.asarray(given)
     if array.shape != shape:
         raise ParameterError(f"{name} has the shape {array.shape}; it must be {shape}.")
@@ -219,7 +219,10 @@ def checked_codes(
 
 
 def checked_rng_table(given: npt.NDArray[np.uint32] | None, rng: RngKind) -> npt.NDArray[np.uint32] | None:
-    """Return `given` as a read-only uint32 array. A generator with a table needs it; for others it must be None."""
+    """Return `given` as a read-only uint32 array, or None if `rng` is not `TABLE`.
+
+    Raises a ParameterError if the table is missing, superfluous or invalid.
+    """
     if rng is not RngKind.TABLE:
         if given is not None:
             raise ParameterError(f"There is a table of random numbers, but rng = {rng} does not use one.")
@@ -239,7 +242,7 @@ def checked_rng_table(given: npt.NDArray[np.uint32] | None, rng: RngKind) -> npt
 
 
 def frozen(array: npt.NDArray[_Scalar]) -> npt.NDArray[_Scalar]:
-    """Return a C-contiguous read-only array: a copy, unless the array already is one."""
+    """Return a read-only C-contiguous copy, or the array itself if it is already read-only and C-contiguous."""
     if array.flags.c_contiguous and array.flags.owndata and not array.flags.writeable:
         return array
     copy = array.copy(order="C")

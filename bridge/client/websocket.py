@@ -1,9 +1,9 @@
 """One WebSocket connection of the client, with clear errors and detection of silent servers.
 
-A message goes directly from the socket's callback to its receiver, without a queue or a task in between.
+Messages go directly from the socket's callback to `on_messages`, without a queue or a task in between.
 
-All data from the server counts as a sign of life, not only pongs. The connection to a silent server is closed
-after `ping_interval + ping_timeout`.
+If no data comes from the server for `ping_interval + ping_timeout` seconds, the connection is closed. All data
+counts as a sign of life, not only pongs.
 """
 
 import asyncio
@@ -39,7 +39,7 @@ from bridge.transport.frames import is_impossible
 from bridge.transport.websocket import MESSAGE_BYTES_HEADER, WebSocketTransport
 
 WRITE_LIMIT: Final = 1 << 16
-"""Maximum number of bytes that wait for the server before publishers must wait too."""
+"""Number of unsent bytes above which publishers must wait."""
 CLOSE_TIMEOUT: Final = 1.0
 """Timeout in seconds of the closing handshake."""
 _OVERSLEPT: Final = 0.5
@@ -77,7 +77,7 @@ def check_uri(uri: str) -> WebSocketURI:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """Limits of a connection in seconds and bytes (see `bridge.client.connect`)."""
+    """Limits of a connection (see `bridge.client.connect`). `max_size` is in bytes, and all times are in seconds."""
 
     connect_timeout: float
     max_size: int
@@ -92,12 +92,12 @@ class Limits:
 
 
 class Loss(Enum):
-    """Cause of the end of a connection, as far as it matters to the next one."""
+    """Cause of the end of a connection. Only causes that affect the next connection are distinguished."""
 
     RECEIVED_TOO_LARGE = auto()
     """The server sent a message above `max_size`."""
     SENT_TOO_LARGE = auto()
-    """This client sent a message above the limit of the server."""
+    """This client sent a message that is larger than the server permits."""
     OTHER = auto()
 
 
@@ -106,7 +106,7 @@ class WebSocket(WebSocketTransport):
 
         connect_along -> handshake() -> begin() -> messages ... -> close(), or the end by the server or the network
 
-    There are no callbacks before `begin`: until then the caller of `handshake` gets the error.
+    Before `begin`, no callback is called. If the connection ends during the handshake, `handshake` raises the error.
     """
 
     def __init__(
@@ -139,7 +139,7 @@ class WebSocket(WebSocketTransport):
         self._silent_for = 0.0
 
     async def handshake(self, headers: tuple[tuple[str, str], ...]) -> None:
-        """Perform the opening handshake; raise the error that ended it, if any."""
+        """Perform the opening handshake with additional `headers`. If the handshake fails, raise its error."""
         request = self._client_protocol.connect()
         request.headers.update(headers)
         request.headers.setdefault("User-Agent", USER_AGENT)
@@ -198,7 +198,7 @@ class WebSocket(WebSocketTransport):
             self.abort()  # a peer with another protocol may never close the connection
 
     def connection_ended(self, exc: Exception | None) -> None:
-        """Wake `handshake` if it still waits; once `begin` has been called, call `on_lost`."""
+        """Wake `handshake` if it still waits. Call `on_lost` if `begin` has been called."""
         self._answered.set()
         self._cancel_watchdog()
         if self.opened:
@@ -272,15 +272,15 @@ async def open_websocket(
     on_messages: Callable[[list[bytes]], None],
     on_lost: Callable[[WebSocket, str], None],
 ) -> WebSocket:
-    """Connect without compression (permessage-deflate), which on a local network costs more than it saves.
+    """Open a connection without compression. On a local network, compression costs more time than it saves.
 
-    `shown_uri` is the URI without secrets, for errors. `on_messages` is called with messages that arrived
-    together, and `on_lost` once, with the reason, when the connection ends.
+    `shown_uri` is the URI without secrets, for errors. `on_messages` is called with a list of messages that arrived
+    together. When the connection ends, `on_lost` is called once with the reason.
 
     Raises:
-        UnreachableError: nothing answers there.
-        NotRosbridgeError: something answers there, but not as a WebSocket server.
-        AccessRefusedError: the token or certificate is missing or wrong.
+        UnreachableError: No server answers, it accepts no more clients, or its certificate is not trusted.
+        NotRosbridgeError: A server answers, but not as a WebSocket server.
+        AccessRefusedError: The token or certificate of this client is missing or wrong.
     """
     attempt: WebSocket | None = None
 

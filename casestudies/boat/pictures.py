@@ -1,4 +1,4 @@
-"""Pictures of posteriors next to the truth (thesis figure 4.4) and of a frame's time by stage (figure 4.5)."""
+"""Pictures of posteriors next to true positions (thesis figure 4.4), and of a frame's time by stage (figure 4.5)."""
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -18,7 +18,7 @@ from terminal.pictures import new_figure, save_figure
 
 
 class StageKind(StrEnum):
-    """The parts of the system in which a frame spends time: those that the thesis measured, and the host's sockets."""
+    """Kinds of stages in which a frame spends time. The thesis reports a share for each kind except `HOST`."""
 
     ROSBRIDGE = "rosbridge"
     HOST = "between the host's processes"
@@ -27,13 +27,16 @@ class StageKind(StrEnum):
 
 
 THESIS_SHARES: Final = {StageKind.ROSBRIDGE: 0.9874, StageKind.COMPUTING: 0.0124, StageKind.REGISTERS: 0.0001}
-"""Shares of the time of a frame that the thesis reports (4.3)."""
+"""The share of each kind of stage in a frame's time, as the thesis reports it (4.3)."""
 PCIE: Final = "pcie-gen2"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageShare:
-    """One stage of a frame: its mean time over the frames that report it, and its share of the sum of these means."""
+    """A stage of a frame: its mean time, and its share of a frame's time.
+
+    `mean_us` is the mean over all frames that report the stage. `share` is relative to the sum of all stages' means.
+    """
 
     name: str
     part: StageKind
@@ -81,10 +84,10 @@ def stage_shares(instances: Iterable[Instance]) -> tuple[StageShare, ...]:
 
 
 def projected_shares(instances: Iterable[Instance], clock_hz: float) -> tuple[StageShare, ...]:
-    """Return the stages as they would be with real boards; empty if the frames do not report cycles and bytes.
+    """Return the stages as projected for real boards, or () if the frames do not report cycles and bytes.
 
-    The time of computing is that of the cycles that the boards counted, at `clock_hz`. The time of the link comes from
-    a model of PCIe, for the bytes transferred. The times of host and rosbridge are measured.
+    The computing time is the number of cycles that the boards counted, divided by `clock_hz`. A model of PCIe gives
+    the time of the link for the bytes transferred. The times of host and rosbridge are measured.
     """
     stages = (
         _STAGES[0],
@@ -98,7 +101,7 @@ def projected_shares(instances: Iterable[Instance], clock_hz: float) -> tuple[St
 
 
 def mean_link_us(instances: Iterable[Instance], rate: str) -> float:
-    """Return the mean microseconds of a frame's transfers on a link of rate `rate` (--link-rate); 0 if not reported."""
+    """Return the mean time of a frame's transfers on a link of this `--link-rate` in us, or 0 if it is not reported."""
     return sum(share.mean_us for share in _shares(instances, (("", StageKind.REGISTERS, _link_us(rate)),)))
 
 
@@ -201,10 +204,10 @@ def draw_shares(
     note: str = "",
     beside: Mapping[StageKind, float] = MappingProxyType({}),
 ) -> None:
-    """Draw figure 4.5, the mean time of each stage and its share of a frame's time, or raise an OutputError.
+    """Draw figure 4.5: the mean time of each stage, and its share of a frame's time.
 
-    `note` is below the axis. The legend has the share of each kind of stage, and next to it the thesis's share from
-    `beside`, if any.
+    `note` is written below the axis. The legend shows the share of each kind of stage. For the kinds in `beside`, the
+    legend also shows the thesis's share. Raises an OutputError if the file cannot be written.
     """
     figure = new_figure(8.4, 1.5 + 0.42 * max(len(shares), 1))
     axes = figure.subplots()
@@ -238,7 +241,7 @@ def draw_shares(
 
 
 def posterior_grid(posterior: Posterior) -> Grid:
-    """Return the map as a grid of the posterior's cells, or raise an OutputError."""
+    """Return the map divided into the posterior's cells. Raises an OutputError if the posterior is not over a map."""
     if len(posterior.sizes) != 2:
         raise OutputError(
             f"the boat's posterior has two dimensions, y and x, but the one received has "

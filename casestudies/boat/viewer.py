@@ -1,4 +1,4 @@
-"""Viewer of the boat's posteriors, true positions and frame reports, received from the three topics."""
+"""Viewer of the boat's posteriors, true positions and frame reports, each received from its own topic."""
 
 import math
 from collections import deque
@@ -26,7 +26,7 @@ POSITIONS_PICTURE: Final = "figure-4.4.png"
 SHARES_PICTURE: Final = "figure-4.5.png"
 PROJECTED_PICTURE: Final = "figure-4.5-projected.png"
 CLOCK_HZ: Final = 100e6
-"""Assumed clock of real boards, as in `toolchain inspect`, because the thesis does not state one."""
+"""Assumed clock of real boards in hertz, as in `toolchain inspect`. The thesis does not state a clock."""
 Clock: TypeAlias = Annotated[
     float,
     typer.Option(
@@ -37,7 +37,7 @@ HEADING: Final = "frame     true x, y     mean x, y  distance     cycles   time 
 
 
 Numbers = dict[str, Any]
-"""A frame as a JSON object; None means unknown."""
+"""A frame as a JSON object. An unknown value is None."""
 
 
 def numbers_of(instance: "Instance") -> Numbers:
@@ -111,7 +111,7 @@ class BoatViewer:
     """
 
     def __init__(self, count: int | None, clock_hz: float = CLOCK_HZ) -> None:
-        """Start without frames; `count` is the number of results to wait for, None to run until Ctrl-C."""
+        """Start without frames. `count` is the number of results to wait for, or None to run until Ctrl-C."""
         self.count = count
         self.clock_hz = clock_hz
         kept = KEPT if count is None else None
@@ -132,7 +132,7 @@ class BoatViewer:
     async def watch(
         self, uri: str, *, truth_topic: str, truth_tolerance_s: float, first_limit_s: float, limit_s: float
     ) -> None:
-        """Listen until all results have arrived, and print a line for each frame.
+        """Listen and print a line for each frame, until `self.count` results have arrived.
 
         Raises:
             NoResultError: No result came in time.
@@ -163,7 +163,7 @@ class BoatViewer:
                     warn(f"frames on /bm/frame without their result: {listener.announced_only}")
 
     def draw(self, folder: Path) -> tuple[Path, ...]:
-        """Write the pictures and return their paths, or raise an OutputError."""
+        """Write the pictures into `folder` and return their paths. Raises an OutputError if that fails."""
         from casestudies.boat.pictures import (
             PCIE,
             THESIS_SHARES,
@@ -196,7 +196,7 @@ class BoatViewer:
         return tuple(written)
 
     def medians(self) -> tuple[float | None, float | None]:
-        """Return the median distance in cells and the median time in milliseconds of the frames; None if not known."""
+        """Return the median distance in cells and the median time of a frame in ms. An unknown median is None."""
         distances, times = (
             [each[key] for each in self.numbers if each[key] is not None]
             for key in ("distance_cells", "time_ms")
@@ -204,7 +204,7 @@ class BoatViewer:
         return median(distances) if distances else None, median(times) if times else None
 
     def write_numbers(self, path: Path) -> None:
-        """Write the frames and the times by stage as one JSON object, or raise an OutputError."""
+        """Write the frames and the mean time of each stage as one JSON object, or raise an OutputError."""
         from casestudies.boat.pictures import projected_shares, stage_shares
 
         def stages(shares: "Iterable[StageShare]") -> list[Numbers]:
@@ -255,7 +255,7 @@ def boat_viewer(
 ) -> None:
     """Show each posterior's mean next to the boat's true position, and draw the thesis's figures 4.4 and 4.5.
 
-    It subscribes to /BMresults, /bm/frame and the topic of the true pose, and needs nothing else.
+    The viewer needs only the topics /BMresults and /bm/frame, and the topic of the true pose.
     """
     from casestudies.topics import run_viewer
 

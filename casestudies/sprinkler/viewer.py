@@ -212,7 +212,7 @@ def sprinkler_viewer(
 ) -> None:
     """Show P(R = 1) of each frame and its error next to the exact value, and draw how the estimates converge.
 
-    It subscribes to /BMresults, /bm/frame and /bm/samples, and needs nothing else.
+    The viewer needs only the topics /BMresults, /bm/frame and /bm/samples.
     """
     viewer = SamplesViewer(count)
     if out is not None:

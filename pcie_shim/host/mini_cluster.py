@@ -33,9 +33,9 @@ from pcie_shim.host.socket_link import LONGEST_POLL_S
 from pcie_shim.programming_file import Image
 
 SLACK_S: Final = 5.0
-"""Seconds that a board may take beyond the time for its cycles at its measured speed."""
+"""Default of `slack`: seconds that a frame may take in addition to its cycles at the boards' measured speed."""
 FIRST_WAIT_S: Final = 0.01
-"""Maximum wait in seconds during which only the board that was started last is polled."""
+"""Maximum number of seconds for which `collect` polls only the board that was started last."""
 PROGRAMMING_S: Final = 30.0
 """Minimum timeout of each step of programming a blank board, in seconds."""
 
@@ -95,7 +95,7 @@ class MiniCluster:
     """All boards of a deployment, in the order of the partition. Only one thread may use a MiniCluster."""
 
     def __init__(self, boards: Sequence[DrivenBoard], *, timeout: float, slack: float) -> None:
-        """Store the boards; use `open`, which also connects."""
+        """Store the boards without connecting. Call `open` instead, which also connects."""
         self._boards = tuple(boards)
         first = self._boards[0].image
         self._machines = first.kind.on_host([board.image.machine for board in self._boards])
@@ -162,11 +162,14 @@ class MiniCluster:
         self.close()
 
     def is_open(self, board: int) -> bool:
-        """Return whether board number `board` is usable; otherwise `reopen` it."""
+        """Return whether the board with the index `board` is usable. If it is not, call `reopen`."""
         return self._boards[board].link is not None or self._boards[board] in self._interrupted
 
     def reopen(self, board: int, *, timeout: float | None = None) -> None:
-        """Reopen a board after its restart or a broken link, and program a blank one, or raise a BoardError."""
+        """Reopen a board after the board has restarted or its link has broken. A blank board is programmed.
+
+        Raises a BoardError if the board cannot be opened.
+        """
         self._open(self._boards[board], self._timeout if timeout is None else timeout)
 
     def close(self) -> None:
@@ -193,7 +196,7 @@ class MiniCluster:
         return output
 
     def post(self, frame: FrameInput) -> None:
-        """Start a frame on all boards without waiting; `collect` returns its result. Errors as for `run`."""
+        """Start a frame on all boards without waiting. `collect` returns the result. Raises the errors of `run`."""
         if self._progress is not None:
             raise FrameInputError("A frame is in progress; collect its result before posting the next")
         try:
@@ -215,10 +218,10 @@ class MiniCluster:
             raise
 
     def collect(self, seconds: float) -> FrameOutput | None:
-        """Receive the answers to the posted frame, and start its next slice if any. Errors as for `run`.
+        """Receive the boards' answers to the posted frame. If all boards have answered, start the next slice, if any.
 
-        It waits for at most `seconds` if nothing has arrived yet. It returns the result of the frame, or None
-        while boards are running: then `awaited` is the descriptor to poll.
+        `collect` waits for answers for at most `seconds`. It returns the result of the frame, or None if boards are
+        still running. In this case, poll the descriptor `awaited` before the next call. Raises the errors of `run`.
         """
         progress = self._progress
         if progress is None:
@@ -236,7 +239,7 @@ class MiniCluster:
 
     @property
     def awaited(self) -> int | None:
-        """Descriptor to poll before the next `collect`; None if no frame is in progress."""
+        """Descriptor to poll before the next `collect`, or None if no board is running."""
         progress = self._progress
         if progress is None:
             return None
@@ -245,7 +248,7 @@ class MiniCluster:
 
     @property
     def seconds_left(self) -> float:
-        """Seconds until the deadline of the posted frame: call `collect` by then."""
+        """Seconds until the deadline of the running slice, or 0 without a frame. Call `collect` before the deadline."""
         return 0.0 if self._progress is None else max(0.0, self._progress.deadline - time.monotonic())
 
     def _expect_done(self, progress: _Progress) -> None:

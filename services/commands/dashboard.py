@@ -1,4 +1,4 @@
-"""The command `dashboard`: the page in the browser."""
+"""The command `dashboard`, which serves a page that shows posteriors."""
 
 import asyncio
 import os

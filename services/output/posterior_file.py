@@ -1,4 +1,4 @@
-"""Files of posteriors: appended JSON or CSV lines, or one NumPy archive that is always complete."""
+"""Files of posteriors. JSON and CSV lines are appended to a file; a NumPy archive is always replaced as a whole."""
 
 import contextlib
 import csv
@@ -20,7 +20,7 @@ from posteriors.posterior import Posterior
 from services.errors import SettingsError
 
 MOST_NUMBERS: Final = 1 << 26
-"""Maximum number of probabilities in an archive (512 MiB), because it stays in memory until it is written."""
+"""Maximum number of probabilities in an archive (512 MiB), because they all stay in memory during the run."""
 _EVERY: Final = 5.0
 """Minimum number of seconds between two writes of an archive."""
 _SHARE: Final = 20
@@ -36,11 +36,14 @@ class ResultFile(ABC):
 
     @abstractmethod
     def add(self, frame: FrameOutcome, axes: list[Axis]) -> None:
-        """Save one frame, or raise a SettingsError: the file is unwritable, or has posteriors of another shape."""
+        """Save one frame.
+
+        Raises a SettingsError if the file cannot be written or has posteriors of another shape.
+        """
 
     @abstractmethod
     def close(self) -> None:
-        """Write what is not yet in the file; nothing is added afterwards."""
+        """Write the frames that are not yet in the file. No frame may be added after `close`."""
 
     def _error(self, why: str | OSError) -> SettingsError:
         if isinstance(why, OSError):
@@ -69,7 +72,7 @@ def open_result_file(path: Path) -> ResultFile:
 def record(frame: FrameOutcome, axes: list[Axis]) -> dict[str, Any]:
     """Return a frame as the JSON object for `--json` and `.jsonl` files.
 
-    Indices count from 0; `best_value` and `mean_value` exist if a deployment maps indices to values.
+    Indices count from 0. The object has `best_value` and `mean_value` only if a deployment maps indices to values.
     """
     known: dict[str, Any] = {"frame": frame.number, "stamp_ns": frame.stamp_ns, "cycles": frame.cycles}
     report = frame.report if isinstance(frame, Posterior) else frame
@@ -101,7 +104,7 @@ def record(frame: FrameOutcome, axes: list[Axis]) -> dict[str, Any]:
 
 
 def cell_names(labels: Sequence[str], sizes: Sequence[int]) -> list[str]:
-    """Return the names of all cells of a posterior, such as `y=1 x=2`, in the order of its probabilities."""
+    """Return the names of all cells of a posterior, such as `y=1 x=2`, in the order of the probabilities."""
     cells = product(*(range(size) for size in sizes))
     return [" ".join(f"{label}={at}" for label, at in zip(labels, cell, strict=True)) for cell in cells]
 

@@ -1,1 +1,1 @@
-"""The processes between a robot and its boards: subscriber, pcie-app, publisher."""
+"""The processes between a robot and its boards: subscriber, pcie-app and publisher."""

@@ -1,8 +1,8 @@
-"""Advice on the machine for a question: BM1, BM2, and exact inference on this host, at one accuracy (thesis 5.2).
+"""Advice on whether to answer a question with a BM1, a BM2 or exact inference on a CPU (thesis 5.2).
 
-Both machines are emulated on readings drawn from the model, with longer and longer frames until their mean total
-variation from exact inference is small enough. For a machine that would need more than `MOST_CYCLES`, the advice gives
-the total variation that it reached, and says why it is no smaller.
+Both machines are emulated on readings drawn from the model. Frames are lengthened until the mean total variation from
+exact inference is small enough. If a machine does not reach the accuracy asked for within `MOST_CYCLES` cycles, the
+advice gives the total variation reached, and the reason why it is no smaller.
 """
 
 import json
@@ -33,7 +33,7 @@ from toolchain.models.model import Model
 from toolchain.models.network import NetworkModel
 
 MOST_CYCLES: Final = 30_000_000
-"""Maximum number of cycles of a frame, because their emulation takes time."""
+"""Maximum number of cycles of a frame, because more cycles would take too long to emulate."""
 _NEAR: Final = 0.8
 """A value above this share of its limit is near it: an error near the accuracy asked for, cycles near `MOST_CYCLES`."""
 _ATTEMPTS: Final = 8
@@ -76,7 +76,7 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Advice:
-    """The machines for a question, the median time of exact inference, and a recommendation."""
+    """The results of each machine for a question, the median time of exact inference, and a recommendation."""
 
     model: str
     question: str
@@ -97,7 +97,7 @@ class Advice:
         return json.dumps(content) + "\n"
 
     def report(self) -> str:
-        """Return the advice as a table and sentences."""
+        """Return the advice as text: a table, followed by sentences."""
         exact = f"Exact inference on this host: {with_unit(self.exact_seconds, 's')}."
         shown = [each for each in self.machines if not each.refused]
         cells = {
@@ -127,9 +127,10 @@ class Advice:
 def advise(
     source: Model | Question, options: AdviceOptions, begun: Callable[[str], None] = lambda _: None
 ) -> Advice:
-    """Compare the machines for a model or a question, or raise a ToolchainError if exact inference is impossible.
+    """Compare a BM1, a BM2 and exact inference for a model or a question.
 
-    `begun` is called at the beginning of each run, with a text about it.
+    At the start of each run, `begun` is called with a description of the run. Raises a ToolchainError if exact
+    inference is impossible.
     """
     device = device_named(options.device)
     network = network_for(source)

@@ -17,10 +17,10 @@ from toolchain.deployment import Stop
 from toolchain.errors import BuildError
 
 Inputs: TypeAlias = "tuple[int, ...] | NDArray[np.int64]"
-"""Inputs of a frame: the address of the reading in each column's table, or int64[sensors, all lines] if each line
-has its own readings."""
+"""Inputs of a frame: for each sensor column, the address of the reading in the column's table. If each line has its
+own readings, the inputs are an array int64[sensors, lines of all boards]."""
 WrittenPrior: TypeAlias = "NDArray[np.uint16] | None"
-"""Codes of a prior that the host writes for a frame, uint16[all lines]; None to use the prior of the machines."""
+"""Codes of a prior that the host writes for a frame, uint16[lines of all boards], or None to use the built prior."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -38,12 +38,15 @@ class FrameRun:
 
     @property
     def posterior(self) -> NDArray[np.float64] | None:
-        """float64[all lines] with the sum 1, or None if all counts are 0."""
+        """The posterior, float64[lines of all boards] with the sum 1, or None if all counts are 0."""
         return joint_posterior(self.counts, self.cycles)
 
 
 class EmulatedBoards:
-    """Boards among which the lines of one machine are divided; a BuildError if `target_count` exceeds the counters."""
+    """Emulated boards among which the lines of one machine are divided.
+
+    Raises a BuildError if `target_count` or `max_cycles` is out of range.
+    """
 
     def __init__(
         self, machines: Sequence[BM1Machine], *, target_count: int, max_cycles: int, stop: Stop
@@ -80,13 +83,13 @@ class EmulatedBoards:
 
     @property
     def parameters(self) -> BM1Parameters:
-        """Parameters of the first board; on the others only the number of lines differs."""
+        """Parameters of the first board. The other boards differ only in the number of lines."""
         return self.machines[0].parameters
 
     def parts(self, inputs: Inputs, prior: WrittenPrior) -> Iterator[tuple[Inputs, WrittenPrior]]:
-        """Return each board's inputs of a frame, and its part of a written prior (None if no prior is written).
+        """Return the inputs of each board in a frame, with the board's part of a written prior or None.
 
-        Inputs of lines are split among the boards; addresses of columns go to all boards.
+        If each line has its own readings, the inputs are split among the boards. Otherwise each board gets all inputs.
         """
         count, ends = len(self.machines), self._ends
         of_boards = [inputs] * count if isinstance(inputs, tuple) else np.split(inputs, ends, axis=1)
@@ -152,7 +155,7 @@ class EmulatedBoards:
 def addressed_chances(
     machine: BM1Machine, addresses: Inputs, prior_address: int, prior: WrittenPrior = None
 ) -> NDArray[np.float64]:
-    """Return the probability that each cell gives a 1 in a cycle: float64[columns, lines], the prior first."""
+    """Return the probability of a 1 in a cycle for each column and line: float64[columns, lines], the prior first."""
     frame = Start(
         addresses=addresses, prior_address=prior_address, prior_codes=prior, target_count=1, max_cycles=1
     )
@@ -160,12 +163,12 @@ def addressed_chances(
 
 
 def one_replica(machine: BM1Machine) -> BM1Machine:
-    """Return a single machine that has the same counts as one replica of a board."""
+    """Return `machine` with a single replica. Its counts are those of each replica with the same inputs."""
     return replace(machine, parameters=replace(machine.parameters, replicas=1))
 
 
 def joined(machines: Sequence[BM1Machine]) -> BM1Machine:
-    """Return the machine with the lines of all boards, from the boards' machines."""
+    """Join the machines of all boards, and return the machine with all their lines."""
     first = machines[0]
     return BM1Machine(
         replace(first.parameters, lines=sum(machine.parameters.lines for machine in machines)),

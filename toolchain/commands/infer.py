@@ -1,4 +1,4 @@
-"""The command `toolchain infer`: the posteriors of a whole recording."""
+"""The command `toolchain infer`, which computes the posteriors of a whole recording."""
 
 import sys
 import time
@@ -32,7 +32,7 @@ def infer(
     """Compute the posterior of every row of a recording, as the boards would.
 
     For example `toolchain infer DATA/ds1_robot3.csv -d build/mrclam -o posteriors.npz --reading 'range_*=range_*_m'
-    --reading 'bearing_*=bearing_*_rad'`; after Ctrl-C, the same command goes on where it was.
+    --reading 'bearing_*=bearing_*_rad'`. To continue after Ctrl-C, run the same command again.
     """
     from toolchain.analysis.readings import recorded_frames
     from toolchain.analysis.replay import check_request, replay

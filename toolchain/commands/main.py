@@ -36,7 +36,7 @@ app.add_typer(regeneration, name="regenerate")
 
 @app.callback()
 def toolchain() -> None:
-    """Build, check and inspect deployments of Bayesian machines, from models in Python or network files."""
+    """Build, check and inspect deployments of Bayesian machines. A model is Python code or a network file."""
 
 
 Directory: TypeAlias = Annotated[
@@ -61,10 +61,10 @@ def memories(
     ] = None,
     verbose: Verbose = False,
 ) -> None:
-    """Write the parameters and memory files again; with --model also the images, with the tables of the model.
+    """Write the parameters and memory files again. With --model, also write images with the tables of the model.
 
-    For example `toolchain regenerate memories build/boat --model casestudies/boat`. Everything else in
-    deployment.toml, such as topics and endpoints, does not change.
+    For example `toolchain regenerate memories build/boat --model casestudies/boat`. Other entries of
+    deployment.toml, such as topics and endpoints, do not change.
     """
     from toolchain.building.build import build_date
     from toolchain.building.regenerate import regenerate_memories
@@ -94,10 +94,10 @@ def memories(
 
 
 def images(directory: Directory, verbose: Verbose = False) -> None:
-    """Write the images again from edited memories and parameters, and report the edits.
+    """Write the images again from edited memory files and parameters, and report the edits.
 
-    For example, after an edit of build/boat/bm_arch/Memory_MIFs/board0_prior.mif: `toolchain regenerate images
-    build/boat`. Then program the boards again.
+    For example, edit build/boat/bm_arch/Memory_MIFs/board0_prior.mif. Run `toolchain regenerate images
+    build/boat`, and program the boards again.
     """
     from toolchain.building.edited_sources import regenerate_images
 
@@ -124,10 +124,10 @@ def project(directory: Directory, verbose: Verbose = False) -> None:
 
 
 def deployment(directory: Directory, edits: DeploymentEdits, verbose: Verbose = False) -> None:
-    """Write deployment.toml with other topics, or variables in another order; manual edits are kept.
+    """Change topics, or the order of variables, in deployment.toml. Manual edits of the file are kept.
 
     For example `toolchain regenerate deployment build/boat --order D2,D1,D3,B1,B2,B3` if the first two
-    readings were swapped. Images, memories and boards are not touched. Omitted flags do not change anything.
+    readings were swapped. The command does not change images and memory files. An omitted flag changes nothing.
     """
     from toolchain.building.regenerate import regenerate_deployment
 
@@ -183,11 +183,12 @@ def fit(
         ),
     ] = None,
 ) -> None:
-    """Learn the tables of a model, and its prior, from recordings with ground truth, and report the data behind each.
+    """Learn the tables of a model from recordings with ground truth, and report the data of each table.
 
-    For example `toolchain fit casestudies/mrclam DATA/ds1_robot3.csv -o fit.toml --set landmarks=DATA/landmarks.csv
-    --truth y=ref_y_m --truth x=ref_x_m --reading 'range_*=range_*_m' --reading 'bearing_*=bearing_*_rad'
-    --pool 'range_*' --pool 'bearing_*' --check DATA/ds1_robot5.csv`
+    With --learn-prior, the command also learns the prior. For example `toolchain fit casestudies/mrclam
+    DATA/ds1_robot3.csv -o fit.toml --set landmarks=DATA/landmarks.csv --truth y=ref_y_m
+    --truth x=ref_x_m --reading 'range_*=range_*_m' --reading 'bearing_*=bearing_*_rad' --pool 'range_*'
+    --pool 'bearing_*' --check DATA/ds1_robot5.csv`
     """
     from toolchain.learning.fit_report import run_fit
 
@@ -202,7 +203,7 @@ def new(
 ) -> None:
     """Create a model from a runnable template: a robot in a corridor.
 
-    For example `toolchain new mymodel`; it prints the next steps.
+    For example `toolchain new mymodel`. The command prints the next steps.
     """
     model = name.name
     if not re.fullmatch(r"[A-Za-z]\w{0,60}", model, re.ASCII):

@@ -36,19 +36,19 @@ _Graph: TypeAlias = dict[str, set[str]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Term:
-    """A factor of a product: a table, float64, and the names of its axes."""
+    """A factor of a product: a float64 table, and the names of the table's axes."""
 
     scope: tuple[str, ...]
     table: NDArray[np.float64]
 
     @classmethod
     def of(cls, factor: Factor) -> Self:
-        """Return the term of a factor of a joint distribution."""
+        """Convert a factor of a joint distribution to a term."""
         return cls(tuple(symbol.name for symbol in factor.scope), factor.table)
 
 
 def reduced(term: Term, values: Mapping[str, int]) -> Term:
-    """Return the part of a term in which the symbols named in `values` have these values."""
+    """Fix each symbol in `values` at the given index, and return the term over the remaining symbols."""
     if not any(name in values for name in term.scope):
         return term
     at = tuple(values.get(name, slice(None)) for name in term.scope)
@@ -208,7 +208,7 @@ _SHOWN: Final = 4
 
 
 class Links:
-    """Links between symbols that share a factor, without the symbols in `cut`: those searched or with a fixed value.
+    """Links between symbols that share a factor. Symbols in `cut` are searched or have a fixed value, and are left out.
 
     Symbols in different components are independent, given the symbols in `cut` (moral graph criterion).
     """
@@ -236,7 +236,7 @@ class Links:
         return found
 
     def path(self, start: str, end: str) -> list[str]:
-        """Return the shortest path between two symbols; empty if they are not connected."""
+        """Return the shortest path between two symbols, or an empty list if they are not connected."""
         before = self._reached(start)
         if end not in before:
             return []
@@ -246,7 +246,7 @@ class Links:
         return path[::-1]
 
     def lengths(self, start: str, ends: Sequence[str]) -> dict[str, int]:
-        """Return, for each of `ends` that is connected to `start`, the number of symbols on the shortest path."""
+        """Return the number of symbols on the shortest path from `start` to each of `ends` that is connected to it."""
         before = self._reached(start)
         count = {start: 1}
         for name in before:  # nearer ones are first
@@ -287,7 +287,10 @@ class Links:
 
 
 def relevant(factors: Iterable[Factor], asked: set[str]) -> list[Factor]:
-    """Remove factors that sum to 1: distributions of symbols that are neither in `asked` nor parents of others."""
+    """Remove the distributions that sum to 1 without changing the answer, and return the remaining factors.
+
+    A distribution is removed if its symbol is not in `asked` and is in no other remaining factor.
+    """
     kept = list(factors)
     uses: dict[str, int] = {}
     own: dict[str, int] = {}
@@ -312,7 +315,7 @@ def relevant(factors: Iterable[Factor], asked: set[str]) -> list[Factor]:
 
 
 def without_idle(factor: Factor) -> Factor:
-    """Return the factor without the symbols on which the factor's values do not depend."""
+    """Return the factor without the symbols on which its values do not depend. The first symbol always stays."""
     scope, table = list(factor.scope), factor.table
     for axis in range(len(scope) - 1, 0, -1):
         first, last = np.take(table, [0], axis=axis), np.take(table, [-1], axis=axis)

@@ -1,4 +1,4 @@
-"""A builder of joint distributions for readers, with limits and checks; errors give the line."""
+"""A builder of joint distributions, which checks what the readers of network files pass to it."""
 
 import math
 from collections.abc import Sequence
@@ -16,22 +16,22 @@ from toolchain.models.model import MAX_ENTRIES
 
 MAX_VARIABLES: Final = 20_000
 MAX_STATES: Final = 65_535
-"""Maximum number of states of a variable: a column of a machine can have 2^16 - 1 values."""
+"""Maximum number of states of a variable, because a column of a machine can have at most 2^16 - 1 values."""
 MAX_PARENTS: Final = 30
-"""Maximum number of parents: more than a table of 2^24 entries needs, and fewer than the 64 axes of a NumPy array."""
+"""Maximum number of parents. NumPy arrays are limited to 64 axes, and tables to 2^24 entries."""
 MAX_TOTAL: Final = 2 * MAX_ENTRIES
 """Maximum number of entries of all tables together."""
 MAX_NAME: Final = 200
 
 ROUNDING: Final = 0.02
-"""Maximum difference between the sum of a distribution and 1: published networks are rounded to two or three digits."""
+"""Maximum difference between the sum of a distribution and 1, because networks are published with rounded numbers."""
 
 
 class Place(Protocol):
-    """A reader's current place in its file, for errors."""
+    """A reader's current position in its file, for error messages."""
 
     def error(self, sentence: str) -> NetworkFileError:
-        """Return an error that starts with the file and the line, followed by the sentence."""
+        """Return an error whose message contains the file, the line and `sentence`."""
 
 
 class NetworkBuilder:
@@ -50,7 +50,7 @@ class NetworkBuilder:
         self._entries = 0
 
     def name(self, name: str) -> None:
-        """Set the name of the network; instead of `unknown` and similar names, the file's name is used."""
+        """Set the name of the network. Instead of a placeholder such as `unknown`, the file's name is used."""
         if name.lower() not in {"unknown", "network", "unnamed", "default", ""}:
             self._name = "".join(each for each in name if each.isprintable())[:MAX_NAME]
 
@@ -61,7 +61,7 @@ class NetworkBuilder:
         return self._symbols[name].size
 
     def state(self, name: str, label: str, place: Place) -> int:
-        """Return the index of a state by its label."""
+        """Return the index of the state `label` of the variable `name`."""
         self.size(name, place)
         try:
             return self._symbols[name].index(label)
@@ -69,7 +69,7 @@ class NetworkBuilder:
             raise place.error(str(reason)) from None
 
     def variable(self, name: str, states: Sequence[str] | int, place: Place) -> None:
-        """Add a variable with the names or the number of its states."""
+        """Add a variable. `states` contains the names of its states, or is their number."""
         if not 0 < len(name) <= MAX_NAME:
             raise place.error(f"a variable's name has {len(name)} characters, expected 1 to {MAX_NAME}")
         if not name.isprintable():
@@ -92,7 +92,7 @@ class NetworkBuilder:
             raise place.error(f"variable {name}: {reason}") from None
 
     def shape(self, scope: Sequence[str], place: Place) -> tuple[int, ...]:
-        """Return the shape of a table over some variables, after checking the limits."""
+        """Return the shape of a table over the variables in `scope`, after checking the limits of tables."""
         if len(scope) > MAX_PARENTS + 1:
             raise place.error(f"a table of {len(scope)} variables; the maximum is {MAX_PARENTS + 1}")
         if len(set(scope)) < len(scope):
@@ -110,7 +110,10 @@ class NetworkBuilder:
     def distribution(
         self, child: str, parents: Sequence[str], values: NDArray[np.float64], place: Place
     ) -> None:
-        """Add P(child | parents), float64[child's states, each parent's]; normalise sums within `ROUNDING` of 1."""
+        """Add P(child | parents), float64[states of the child, states of each parent].
+
+        Sums over the child's states that differ from 1 by at most `ROUNDING` are normalised.
+        """
         if child in self._children:
             raise place.error(f"{child} has two tables")
         self._children.add(child)
@@ -142,7 +145,7 @@ class NetworkBuilder:
             raise place.error(str(reason)) from None
 
     def joint(self) -> JointDistribution:
-        """Return the joint distribution; its symbols are in the order of the file."""
+        """Return the joint distribution. Raises a ModelError if a variable has no table."""
         if not self._symbols:
             raise ModelError("the file has no variables")
         used = {symbol.name for symbol in chain.from_iterable(factor.scope for factor in self._factors)}
