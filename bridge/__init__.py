@@ -1,5 +1,6 @@
-"""rosbridge without ROS: protocol core, asyncio client, field lookup in messages, embedded server.
+"""The rosbridge protocol without ROS: an asyncio client, an embedded server, and access to fields of messages.
 
-Start at `bridge.client` (`connect`: topics, services and actions) or `bridge.hub.server` (`serve_hub`: a server for
-programs and tests). `bridge.errors` contains the errors of connections and messages.
+`connect` in `bridge.client` connects to a server, for topics, services and actions. `serve_hub` in
+`bridge.hub.server` runs a server for programs and tests. `bridge.errors` contains the errors of connections and
+messages.
 """

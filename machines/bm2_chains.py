@@ -69,10 +69,10 @@ _Ran = tuple[Integers, list[int], npt.NDArray[Any]]
 
 
 class Chains:
-    """Chains of one model: machines that differ only in `chain` and `chains`.
+    """The chains of one model, each with a machine. The machines differ only in `chain` and `chains`.
 
     Raises:
-        ParameterError: The machines differ in something else.
+        ParameterError: The machines differ in other parameters, or in their tables.
     """
 
     def __init__(self, machines: Sequence[BM2Machine]) -> None:

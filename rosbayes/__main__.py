@@ -1,4 +1,7 @@
-"""The command `rosbayes`: `rosbayes hub` is `hub`. A subcommand's module is imported only when it is named."""
+"""The command `rosbayes`. Its subcommands are the project's commands: `rosbayes hub` runs `hub`.
+
+If the command line names a subcommand, only the module of this subcommand is imported.
+"""
 
 from importlib.metadata import version
 from typing import Annotated
@@ -28,7 +31,7 @@ def rosbayes(
 ) -> None:
     """Bayesian machines for any ROS robot.
 
-    Start with `rosbayes demo`. The other subcommands also exist without `rosbayes`: `rosbayes hub` is `hub`, and
+    Start with `rosbayes demo`. Each other subcommand also exists as a separate command: `rosbayes hub` is `hub`, and
     `rosbayes build` is `toolchain build`.
     """
 

@@ -25,7 +25,7 @@ from bridge.codecs.json_codec import MAX_DEPTH, MAX_SIZE, excerpt
 from bridge.errors import DecodeError, EncodeError
 
 Arrays = Literal["list", "numpy"]
-"""Form of a decoded typed array: a list of numbers (bytes for `uint8[]`), or a read-only NumPy array."""
+"""Form of decoded typed arrays: lists of numbers, with `bytes` for `uint8[]`, or read-only NumPy arrays."""
 
 TYPED_ARRAYS: Final = {
     64: ("<u1", "B"),
@@ -39,7 +39,7 @@ TYPED_ARRAYS: Final = {
     85: ("<f4", "f"),
     86: ("<f8", "d"),
 }
-"""Element types by tag: their names in NumPy, and in the modules `array` and `struct`."""
+"""Element type of each CBOR tag: its NumPy name, and its code in the modules `array` and `struct`."""
 _BYTES_TAG: Final = 64
 _TAGS: Final = {name[1:]: tag for tag, (name, _code) in TYPED_ARRAYS.items()}
 _TEXT: Final = frozenset({str})
@@ -158,10 +158,10 @@ def _check(message: dict[str, Any], arrays: Arrays, data: bytes) -> None:
 
 
 def encode_json(message: dict[str, Any]) -> bytes:
-    """Write as CBOR a message that was read from JSON and whose type is unknown.
+    """Return the CBOR encoding of a message that was read from JSON, if the message's ROS type is unknown.
 
-    Lists of numbers with at least one float become typed arrays of float64, with NaN for None. Lists of only integers
-    remain lists, because their width is unknown.
+    A list of numbers with at least one float becomes a typed array of float64, and None becomes NaN. A list of
+    integers remains a list, because the width of the integers is unknown.
     """
     return cbor2.dumps(_packed(message))
 
@@ -221,7 +221,7 @@ def with_arrays(value: Any) -> Any:
 
 
 def with_lists(value: Any) -> Any:
-    """Replace every NumPy array in a message, in place: uint8 becomes bytes, all others lists of numbers."""
+    """In a message, replace every NumPy array in place: uint8 by `bytes`, other arrays by lists of numbers."""
     import numpy as np
 
     def list_of(part: Any) -> Any:

@@ -17,15 +17,15 @@ from casestudies.grid import Grid
 from terminal.one_line import shown
 
 MAP_LOW: Final = -50.0
-"""Lowest coordinate of the map, the square [MAP_LOW, MAP_HIGH]^2."""
+"""Lowest x and y of the map, in map units. The map is the square [MAP_LOW, MAP_HIGH]^2."""
 MAP_HIGH: Final = 50.0
 BEACONS: Final = ((-50.0, -50.0), (-50.0, 0.0), (0.0, -50.0))
-"""Positions of the beacons: lower left corner, middle of the left side, middle of the lower side (thesis 4.1)."""
+"""Positions of the beacons: the lower left corner, and the middles of the left and the lower side (thesis 4.1)."""
 BEACON_NAMES: Final = ("beacon1", "beacon2", "beacon3")
 DISTANCE_NAMES: Final = ("D1", "D2", "D3")
 BEARING_NAMES: Final = ("B1", "B2", "B3")
 SENSOR_NAMES: Final = DISTANCE_NAMES + BEARING_NAMES
-"""Names of the sensors, in the order of the machine's columns and of the readings in an array message."""
+"""Names of the sensors. The machine's columns and the readings in an array message have this order."""
 LONGEST_DISTANCE: Final = 100
 """Largest distance reading, in map units. Larger distances occur at the map's far corners, and are clamped."""
 BEARING_SIGMA: Final = 10.0
@@ -33,7 +33,7 @@ BEARING_SIGMA: Final = 10.0
 
 
 def map_grid(width: int = 32, height: int = 32) -> Grid:
-    """Return the map as a grid of cells; the thesis ran 32 x 32 on four boards (4.2)."""
+    """Return the map as a grid of cells. The thesis ran a grid of 32 x 32 cells on four boards (section 4.2)."""
     return Grid(x_low=MAP_LOW, x_high=MAP_HIGH, y_low=MAP_LOW, y_high=MAP_HIGH, width=width, height=height)
 
 
@@ -43,13 +43,13 @@ def distance(x: float, y: float, beacon: tuple[float, float]) -> float:
 
 
 def bearing(x: float, y: float, beacon: tuple[float, float]) -> float:
-    """Return the absolute bearing of (x, y) as seen from a beacon, in degrees, 0 <= bearing < 360, 0 along +x."""
+    """Return the absolute bearing of (x, y) from a beacon in degrees, 0 <= bearing < 360, counter-clockwise from +x."""
     degrees = math.degrees(math.atan2(y - beacon[1], x - beacon[0])) % 360.0
     return degrees if degrees < 360.0 else 0.0  # a tiny negative angle rounds up to 360 in the modulo
 
 
 def distance_sigma(true_distance: float) -> float:
-    """Return the standard deviation of a distance reading at this true distance, in map units."""
+    """Return the standard deviation of distance readings at the distance `true_distance`, both in map units."""
     return true_distance / 10.0 + 5.0
 
 
@@ -61,9 +61,9 @@ ARRAY_TYPE: Final = "std_msgs/Float64MultiArray"
 TRUE_POSE_TOPIC: Final = "/boat/true_pose"
 TRUE_POSE_TYPE: Final = "geometry_msgs/PoseStamped"
 SET_POSE_TOPIC: Final = "/boat/set_pose"
-"""Topic on which anybody may publish a pose to move the boat there, of the same type as the true pose."""
+"""Topic for poses to which the boat is moved, of `TRUE_POSE_TYPE`. Any client may publish them."""
 DRIVE_TOPIC: Final = "/cmd_vel"
-"""Topic on which anybody may publish a velocity to drive the boat."""
+"""Topic for velocities that drive the boat, of `DRIVE_TYPE`. Any client may publish them."""
 DRIVE_TYPE: Final = "geometry_msgs/Twist"
 COMPASS_TOPIC: Final = "/boat/imu"
 COMPASS_TYPE: Final = "sensor_msgs/Imu"
@@ -103,12 +103,12 @@ class BadNumberError(Exception):
 
 
 def read_set_pose(message: dict[str, Any]) -> tuple[float, float]:
-    """Return x and y of a geometry_msgs/PoseStamped, or raise a BadNumberError."""
+    """Return x and y of a geometry_msgs/PoseStamped, or raise a BadNumberError if one is not a finite number."""
     return _number(message, "pose.position.x"), _number(message, "pose.position.y")
 
 
 def read_drive(message: dict[str, Any]) -> tuple[float, float]:
-    """Return the speed forward and the turn to the left of a geometry_msgs/Twist, or raise a BadNumberError."""
+    """Return the forward speed and the turn rate (positive to the left) of a Twist, or raise a BadNumberError."""
     return _number(message, "linear.x"), _number(message, "angular.z")
 
 
@@ -123,7 +123,7 @@ def _finite(field: str, value: object) -> float:
 
 
 def beacon_markers(head: dict[str, Any]) -> dict[str, Any]:
-    """Return the beacons as a visualization_msgs/MarkerArray: a sphere for each, with its name."""
+    """Return a visualization_msgs/MarkerArray that shows each beacon as a sphere with the beacon's name."""
     return {
         "markers": [
             {
@@ -143,7 +143,7 @@ def beacon_markers(head: dict[str, Any]) -> dict[str, Any]:
 
 
 def true_pose(x: float, y: float, head: dict[str, Any], heading: float = 0.0) -> dict[str, Any]:
-    """Return a geometry_msgs/PoseStamped at (x, y), with a heading in radians."""
+    """Return a geometry_msgs/PoseStamped with the header `head`, at (x, y), with a heading in radians."""
     return {
         "header": head,
         "pose": {"position": {"x": x, "y": y, "z": 0.0}, "orientation": _rotation(heading)},
@@ -172,10 +172,10 @@ def _rotation(heading: float) -> dict[str, float]:
 def readings_message(
     values: Sequence[float | None], head: Mapping[str, Any] | None, *, array: bool
 ) -> dict[str, Any]:
-    """Return six readings, in the order of `SENSOR_NAMES`, as a message with this header, if any.
+    """Return a message with six readings, in the order of `SENSOR_NAMES`, and with the header `head` if it is given.
 
-    With `array` it is a std_msgs/Float64MultiArray, which does not have a header. A missing reading (None) is an absent
-    field, or null in an array, as rosbridge writes NaN.
+    With `array`, the message is a std_msgs/Float64MultiArray, which has no header. A missing reading (None) becomes
+    null in an array, because rosbridge writes NaN as null. In any other message, its field is absent.
     """
     if array:
         return {
@@ -193,9 +193,9 @@ def readings_message(
 def read_raw(
     message: Mapping[str, Any], *, array: bool
 ) -> tuple[tuple[float | None, ...], Mapping[str, Any] | None]:
-    """Return the six raw readings of a message and its header, if any, or raise a BadNumberError.
+    """Return the six raw readings and the header of a message, or raise a BadNumberError.
 
-    A reading that is absent, null or NaN is missing: None.
+    A reading that is absent, null or NaN becomes None. The header is None if the message has none.
     """
     if array:
         data = message.get("data")

@@ -1,4 +1,7 @@
-"""The model of a pixel's disparity, P(d) P(k1 | d) P(k2 | d) P(k3 | d), and the case study's topics (thesis 4.4)."""
+"""The model of a pixel's disparity, and the topics of the disparity case study (thesis 4.4).
+
+The model is P(d) P(k1 | d) P(k2 | d) P(k3 | d). d is the disparity, and k1 to k3 are three filters' matching costs.
+"""
 
 from typing import Final
 
@@ -8,18 +11,21 @@ from casestudies.disparity.matching import FILTERS, OUTLIER, SCALES
 from toolchain.models import IntegerType, JointDistribution, Question, Symbol, table, uniform
 
 DISPARITIES: Final = 16
-"""Number of disparities, 0 to 15 pixels: the lines of a machine."""
+"""Number of disparities, from 0 to 15 pixels. A machine has a line for each disparity."""
 PIXELS: Final = 160
-"""Number of pixels that a board computes at once, each with a machine of its own: the board's replicas."""
+"""Number of pixels that a board computes at once. The board has a replica of the machine for each pixel."""
 
 LEFT_TOPIC: Final = "/stereo/left/image_rect"
 RIGHT_TOPIC: Final = "/stereo/right/image_rect"
 TRUTH_TOPIC: Final = "/stereo/true_disparity"
-"""Topic of the simulated cameras' true disparities, 32FC1; NaN where the right camera does not see the point."""
+"""Topic of the simulator's true disparities (32FC1). A point that the right camera does not see has NaN."""
 DISPARITY_TOPIC: Final = "/stereo/disparity"
 TILE_TOPIC: Final = "/disparity/likelihoods"
 TILE_TYPE: Final = "disparity_msgs/Likelihoods"
-"""Fields: a header, and a `uint8[]` named after each filter, with likelihoods per pixel and disparity, at most 255."""
+"""Message type with a header and a `uint8[]` field for each filter, which has the filter's name.
+
+The field of a filter contains a likelihood from 0 to 255 for each pixel and disparity.
+"""
 
 _COSTS: Final = 64
 """Number of costs in the tables, which are only for the model: a machine that gets likelihoods has no tables."""
@@ -29,7 +35,7 @@ def model(disparities: int = DISPARITIES) -> Question:
     """Return the question: which disparity does a pixel have, given the matching costs of three filters?
 
     Args:
-        disparities: The number of disparities, from 0.
+        disparities: The number of disparities. The smallest disparity is 0.
     """
     disparity = Symbol("disparity", IntegerType(0, disparities - 1, unit="px"))
     factors = [uniform(disparity)]

@@ -1,4 +1,6 @@
-"""Conversion of the downloaded data set MR.CLAM into CSV files: a row for each second in which a robot hardly moved.
+"""Conversion of the downloaded data set MR.CLAM into CSV files.
+
+A robot's file has a row for each second in which the robot hardly moved.
 
 python -m casestudies.mrclam.convert MRCLAM_Dataset1 -o DATA_DIR
 """
@@ -24,7 +26,7 @@ from toolchain.bounded_files import read_bounded
 from toolchain.errors import ModelError
 
 LARGEST_FILE: Final = 1 << 28
-"""Maximum size of a file in bytes; the largest file of the data set has about 20 million."""
+"""Maximum size of an input file in bytes. The largest file of the data set has about 20 million bytes."""
 LEAST_LANDMARKS: Final = 3
 MOST_MOVED_M: Final = 0.12
 WINDOW_S: Final = 1.0
@@ -54,19 +56,19 @@ class Track:
     heading: Floats
 
     def at(self, time: float) -> tuple[float, float, float]:
-        """Return the position and heading at a time, interpolated linearly."""
+        """Return x (m), y (m) and heading (rad) at a time in seconds, interpolated linearly."""
         x, y, heading = (float(np.interp(time, self.time, each)) for each in (self.x, self.y, self.heading))
         return x, y, heading
 
     def known(self, begin: float, end: float) -> bool:
-        """Return whether the track has no gap between two times."""
+        """Return whether the track covers the time from `begin` to `end`, in seconds, without a gap."""
         inside = self.time[(self.time > begin) & (self.time < end)]
         around = np.concatenate((self.time[self.time <= begin][-1:], inside, self.time[self.time >= end][:1]))
         ends_known = len(around) > 1 and around[0] <= begin and around[-1] >= end
         return bool(ends_known and np.diff(around).max() <= _REFERENCE_GAP_S)
 
     def moved(self, begin: float, end: float) -> float:
-        """Return the diagonal of the bounding box of all positions between two times, in metres."""
+        """Return the diagonal of the bounding box of all positions from `begin` to `end`, in metres."""
         inside = (self.time > begin) & (self.time < end)
         (x_0, y_0, _), (x_1, y_1, _) = self.at(begin), self.at(end)
         x, y = np.append(self.x[inside], (x_0, x_1)), np.append(self.y[inside], (y_0, y_1))
@@ -75,7 +77,7 @@ class Track:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """A sighting by the camera: time (s), landmark, range (m), bearing (rad) relative to the heading."""
+    """A robot's sighting of a landmark. `time` is in seconds, and `bearing_rad` is relative to the robot's heading."""
 
     time: float
     landmark: int
@@ -85,7 +87,10 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """One second of a track: its middle, the reference pose at that time, and the median sighting of each landmark."""
+    """One second of a track. `time` is the middle of the second. The pose is the reference at this time.
+
+    `seen` has the median range (m) and the median absolute bearing (rad) of each landmark.
+    """
 
     time: float
     x: float
@@ -95,9 +100,10 @@ class Window:
 
 
 def read_columns(path: Path, names: Sequence[str]) -> Iterator[tuple[str, tuple[float, ...]]]:
-    """Yield for each line its path and line number, for error messages, and its values, or raise a ModelError.
+    """Yield the place and the numbers of each line of a file, or raise a ModelError.
 
-    In the files of the data set, numbers are separated by spaces, and comments begin with `#`.
+    The place is the path and the line number, for error messages. Numbers are separated by spaces, and comments begin
+    with `#`. `names` are the names of the columns.
     """
     text = read_bounded(path, LARGEST_FILE, ModelError).decode(errors="replace")
     for number, line in enumerate(text.splitlines(), 1):
@@ -156,7 +162,10 @@ def read_track(folder: Path, robot: int) -> Track:
 
 
 def read_measured(folder: Path, robot: int, subjects: dict[int, int]) -> tuple[list[Measured], int]:
-    """Return a robot's sightings of landmarks from `RobotN_Measurement.dat`, and the number of unknown barcodes."""
+    """Return a robot's sightings of landmarks from `RobotN_Measurement.dat`, and the number of misread barcodes.
+
+    A barcode counts as misread if no subject has it, or if its range is negative.
+    """
     path = folder / f"Robot{robot}_Measurement.dat"
     found, misread = [], 0
     for _, (time, barcode, away, bearing) in read_columns(
@@ -171,7 +180,10 @@ def read_measured(folder: Path, robot: int, subjects: dict[int, int]) -> tuple[l
 
 
 def windows(track: Track, measured: Sequence[Measured]) -> tuple[list[Window], Counter[str]]:
-    """Return the seconds in which the robot hardly moved and saw enough landmarks, and count the rest by reason."""
+    """Return the seconds in which the robot hardly moved and saw enough landmarks.
+
+    Also return how many other seconds with sightings are left out, for each reason.
+    """
     kept: list[Window] = []
     left_out: Counter[str] = Counter()
     if not measured:
@@ -212,7 +224,7 @@ def _wrapped(angle: float) -> float:
 
 
 def write_recording(path: Path, kept: Sequence[Window]) -> None:
-    """Write a file that `casestudies.mrclam.player` reads, or raise an OutputError."""
+    """Write a CSV file for `casestudies.mrclam.player`, with a row for each second, or raise an OutputError."""
     heading = ["time_s", "ref_x_m", "ref_y_m", "ref_std_m", "heading_rad"]
     heading += [name for number in LANDMARKS for name in (f"range_{number}_m", f"bearing_{number}_rad")]
     rows = []
@@ -240,7 +252,7 @@ def _write(path: Path, heading: Sequence[str], rows: Sequence[Sequence[str]]) ->
 
 
 def robots_in(folder: Path) -> list[int]:
-    """Return the robots whose measurements are in the folder, or raise a ModelError."""
+    """Return the numbers of the robots with measurements in the folder, or raise a ModelError if there are none."""
     found = sorted(
         int(match[1])
         for path in folder.glob("Robot*_Measurement.dat")
@@ -277,7 +289,8 @@ def convert(
 ) -> None:
     """Convert a downloaded data set into the case study's CSV files.
 
-    They have a line for each second in which a robot moved less than 0.12 m and saw at least three landmarks.
+    A robot's file has a line for each second in which the robot moved less than 0.12 m and saw at least three
+    landmarks.
     """
     subjects, positions = read_barcodes(folder), read_positions(folder)
     robots = robot or robots_in(folder)

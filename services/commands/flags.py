@@ -1,4 +1,4 @@
-"""Flags of the commands: those of settings, made from `Settings`, and others that several commands share."""
+"""Command-line flags for the settings, generated from `Settings`, and further flags that several commands share."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -15,7 +15,7 @@ from toolchain.deployment import Deployment, Source
 
 
 def with_settings(*names: str) -> Callable[[Callable[..., int]], Callable[..., int]]:
-    """Return a decorator that gives a command the flags of the named settings, and all settings as `settings`."""
+    """Return a decorator that adds flags for the settings `names`. The command gets all settings as `settings`."""
 
     def load(**flags: Any) -> Settings:
         end_with_parent()  # first, because the parent may have ended already
@@ -29,7 +29,10 @@ def with_settings(*names: str) -> Callable[[Callable[..., int]], Callable[..., i
 
 
 def refuse_with_deployment(settings: Settings, flags: Mapping[str, str | None]) -> None:
-    """Raise a SettingsError for flags that describe a topic if there is a deployment, which has its own topics."""
+    """Raise a SettingsError if there is a deployment, and one of the flags has a value.
+
+    The flags describe a topic, but a deployment has its own topics.
+    """
     given = [f"{flag} {value}" for flag, value in flags.items() if value]
     # if it were ignored, the command would use another topic than the user named
     if settings.deployment is not None and given:
@@ -39,7 +42,7 @@ def refuse_with_deployment(settings: Settings, flags: Mapping[str, str | None]) 
 
 
 def source_of(uri: str, topic: str, type_: str) -> Source:
-    """Return a topic given by flags, checked like a topic of a deployment, or raise a SettingsError."""
+    """Return the topic that flags describe, or raise a SettingsError if a deployment could not contain this topic."""
     try:
         return Source(uri=uri, topic=topic, type=type_)
     except ValidationError as error:

@@ -47,10 +47,10 @@ if TYPE_CHECKING:
 
 ROLE = "master"
 ANSWER_TIME = 60.0
-"""Seconds by which a service may exceed its own timeouts before it counts as stuck."""
+"""Seconds that a service may take beyond its own timeouts before the master treats it as stuck."""
 
 COMPILING_TIME = 60.0
-"""Additional seconds for boards that the master starts: they compile the kernels that numba has not cached yet."""
+"""Additional seconds for boards that the master starts, because they may first have to compile their kernels."""
 
 _CONNECT_EVERY = 0.01
 _WATCH_EVERY = 1.0
@@ -58,7 +58,7 @@ _RECONNECT_TIME = 60.0
 
 
 class Peer:
-    """A service used by the master: its connection, and its process if the master started it.
+    """A service that the master uses, with its connection. If the master starts it, the peer also has its process.
 
     A service inside the master's process has no endpoint.
     """
@@ -97,7 +97,10 @@ class Peer:
 
 @dataclass(frozen=True, slots=True)
 class Awaited:
-    """A step that the master waits for a peer to take: description, start (monotonic, s) and time limit in seconds."""
+    """A step that a peer has to take in time.
+
+    `what` describes the step. The wait began at `since` (monotonic seconds), and may take `limit` seconds.
+    """
 
     what: str
     since: float
@@ -109,26 +112,26 @@ class PeerEvents(Protocol):
 
     @property
     def is_idle(self) -> bool:
-        """True while no frame is between its reading and its outcome."""
+        """True while no frame is in progress. A frame is in progress from its reading to its outcome."""
 
     def ready(self, peer: Peer) -> None:
         """Handle a peer that has become ready."""
 
     def received(self, peer: Peer, record: AnyRecord) -> None:
-        """Handle a record about a reading, a frame or a result."""
+        """Handle a record that a peer has sent about a reading, a frame or a result."""
 
     def lost(self, peer: Peer) -> None:
-        """Handle the loss of a peer: count the frame or the results that are lost with it."""
+        """Handle the loss of a connection to a peer, and count the frame or the results that are lost."""
 
     def awaited(self, peer: Peer) -> Awaited | None:
-        """Return what a ready peer has to do next; None if nothing."""
+        """Return the step that a ready peer has to take next, or None if it has to take none."""
 
     def fail(self, error: Exception) -> None:
         """End the run."""
 
 
 class Peers:
-    """The three services, and the boards' process if the master starts it."""
+    """The three services that the master uses, and the process of the boards if the master starts this process."""
 
     def __init__(self, settings: Settings, deployment: Deployment, log: Logger, *, once: bool) -> None:
         self._settings = settings
@@ -170,7 +173,7 @@ class Peers:
 
     @property
     def directory(self) -> Path | None:
-        """The folder of the processes' sockets, if the master starts any."""
+        """The run directory, or None if all services run outside the master."""
         return None if self._run is None else self._run.path
 
     @property
@@ -256,7 +259,7 @@ class Peers:
         return 0.0 if self._boards is None else COMPILING_TIME
 
     async def start(self, events: PeerEvents) -> None:
-        """Start peers that are not running, connect to all, and restore lost ones from then on."""
+        """Start the services that do not run yet, and connect to all. From then on, restore lost connections."""
         self._events = events
         if self._boards is not None:
             await self._boards.start()
@@ -303,14 +306,14 @@ class Peers:
             self._begin_task(service, inside=True)
 
     async def leave(self) -> None:
-        """Stop restoring peers, and give services in this process a grace period to end."""
+        """Stop restoring lost connections, and wait up to `stop_timeout` for the end of services in this process."""
         for task in (*self._tasks, *self._inside):
             task.cancel()
         if self._inside:
             await asyncio.wait(self._inside, timeout=self._settings.stop_timeout)
 
     async def end(self) -> None:
-        """Stop the started processes, and release the run directory."""
+        """Stop the processes that the master started, and release the run directory."""
         children = [peer.child for peer in self if peer.child is not None]
         if self._boards is not None:
             children.append(self._boards)

@@ -1,6 +1,6 @@
-"""Output of frames on standard output: each as a line, a JSON object or a picture.
+"""Output of frames on standard output. Each frame becomes a line, a JSON object or a picture.
 
-Pictures are bars for one dimension and a heat map for two, with or without colour.
+A picture has bars for one dimension, or is a heat map for two dimensions. It may have colour.
 """
 
 import contextlib
@@ -32,12 +32,12 @@ _WORDS: Final = 7
 """Number of terminal lines reserved for the text around a picture."""
 
 ROWS: Final = 32
-"""Maximum number of lines in a picture; finer posteriors are drawn in blocks of cells."""
+"""Maximum number of terminal lines in a picture. A posterior with more cells is drawn in blocks of cells."""
 WIDTH: Final = 160
 """Maximum width of a picture in characters."""
 _SHADES: Final = " .:-=+*#%@"
 Show = Callable[[FrameOutcome, list[Axis]], None]
-"""Function that shows a frame; the axes are those of its posterior."""
+"""Type of a function that shows a frame, given the axes of the frame's posterior."""
 
 
 def line(frame: FrameOutcome, axes: list[Axis]) -> str:
@@ -95,7 +95,7 @@ def print_json(frame: FrameOutcome, axes: list[Axis]) -> None:
 
 @contextlib.contextmanager
 def drawing() -> Iterator[Show]:
-    """Yield a function that draws frames: on a terminal in one picture that is updated, elsewhere one below another."""
+    """Yield a function that draws frames. On a terminal, a frame replaces the last frame; elsewhere it is appended."""
     # labels come from the robot's side, so neither brackets nor numbers in them are formatted
     console = Console(highlight=False, markup=False)
     colour = console.color_system is not None and not console.no_color  # NO_COLOR disables it
@@ -136,9 +136,10 @@ def drawing() -> Iterator[Show]:
 
 
 def picture(posterior: Posterior, axes: list[Axis], *, width: int, colour: bool, rows: int = ROWS) -> Text:
-    """Draw a posterior in colour, or with characters from " " to "@", `width` columns wide, in `rows` lines plus text.
+    """Return a picture of a posterior, at most `width` columns wide, with at most `rows` lines besides its text.
 
-    Of three or more dimensions, the two longest are drawn, and the others are summed out.
+    Without colour, characters stand for the probabilities. Of three or more dimensions, the picture shows the two with
+    the most cells, and all other dimensions are summed out.
     """
     # the words around the picture stay on the screen
     width, rows = min(width, WIDTH), max(min(rows, ROWS), 2)

@@ -1,8 +1,8 @@
-"""Findings about a BM2: clipped factors and their error, unconnected states, wide factors, and random numbers.
+"""Findings about a BM2: clipped factors, unconnected states, too large tables, and related random numbers.
 
-Zeros of a factor are clipped to the smallest chance that a code can express, so the chain does enter impossible states,
-but rarely. The error that results is computed exactly if there are few states; otherwise a finding says
-that it was not computed.
+A zero of a factor is clipped to the smallest chance that a code can express. The chain therefore enters impossible
+states, but rarely. If there are few states, the resulting error is computed exactly. Otherwise a finding says that the
+error was not computed.
 """
 
 import math
@@ -42,7 +42,7 @@ _MOVE_CYCLES: Final = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedChain:
-    """The machine of a BM2's first board, to be checked; without `model`, states of hidden variables have no names."""
+    """The machine of a BM2's first board, for the checks. Without `model`, hidden variables have numbers as values."""
 
     deployment: Deployment
     machine: BM2Machine
@@ -62,7 +62,7 @@ class CheckedChain:
         return tuple(f"CDE {at} ({scope})" for at, scope in enumerate(scopes))
 
     def state(self, values: Sequence[int], variables: Sequence[int]) -> str:
-        """Return values of some variables in words: `rain = yes, grass = wet`."""
+        """Return a state as text, `rain = yes, grass = wet`, with only the variables at the indices `variables`."""
         p, deployment = self.machine.parameters, self.deployment
         if self.model is None:
             labels = dict(zip(p.known, (each.states for each in deployment.variables), strict=True))
@@ -80,7 +80,7 @@ class CheckedChain:
 
 
 def chain_findings(chain: CheckedChain) -> Iterator[Finding]:
-    """Find everything about a BM2 that can make its results wrong or slow, or that does not fit a board."""
+    """Yield a finding for everything in a BM2 that can make results wrong or slow, or that does not fit a board."""
     yield from _clips(chain)
     yield from _opposite_clips(chain)
     yield from _connections(chain)
@@ -211,7 +211,7 @@ def _connections(chain: CheckedChain) -> Iterator[Finding]:
 
 
 def legal_states(machine: BM2Machine) -> NDArray[np.bool_]:
-    """Return which states are possible: bool[2**state_bits], by the bits of the state as an index."""
+    """Return for each state whether the state is possible: bool[2**state_bits]. The bits of a state are its index."""
     p, index = machine.parameters, np.arange(1 << machine.parameters.state_bits)
     codes = [index >> offset & (1 << bits) - 1 for offset, bits in zip(p.offsets, p.bits, strict=True)]
     used = [code < cardinality for code, cardinality in zip(codes, p.cardinalities, strict=True)]
@@ -225,9 +225,9 @@ def legal_states(machine: BM2Machine) -> NDArray[np.bool_]:
 def unconnected(
     machine: BM2Machine, legal: NDArray[np.bool_], known: Sequence[int]
 ) -> tuple[int, int] | None:
-    """Return two legal states that no series of moves through legal states connects, or None if there are none.
+    """Return two legal states that no series of single-bit moves connects, or None if there is no such pair.
 
-    Both states have the same known values.
+    All moves go through legal states. Both states have equal values of the variables with the indices `known`.
     """
     p, index = machine.parameters, np.arange(len(legal))
     mask = sum(p.masks[variable] for variable in known)

@@ -1,8 +1,8 @@
-"""The model for a BM1: a searched variable on a grid, and known variables given its values (thesis 2.1.2).
+"""The model for a BM1: a searched variable S on a grid, and known variables that depend on S (thesis 2.1.2).
 
-The machine computes P(S | k_1 ... k_N), proportional to P(S) P(k_1 | S) ... P(k_N | S) (equation 2.2). A
+The machine computes P(S | k_1 ... k_N), which is proportional to P(S) P(k_1 | S) ... P(k_N | S) (equation 2.2). A
 model consists of the prior P(S) and a table P(K_i | S) for each known variable, in the order of the columns.
-`exact_posterior` computes the same in float64, the reference for the posterior of a machine.
+`exact_posterior` computes the posterior in float64, as the reference for the posterior of a machine.
 """
 
 import math
@@ -21,23 +21,25 @@ from toolchain.deployment.sections import NAME_MAX
 from toolchain.errors import ModelError
 
 MAX_LINES: Final = 2**24
-"""Maximum number of values of all searched dimensions together: 4,096 boards, each with as many lines as the register
-map can have.
+"""Maximum number of lines of a model, which is the product of the sizes of the searched dimensions.
+
+4,096 boards have this number of lines if each board has as many lines as the register map permits.
 """
 MAX_VALUES: Final = 2**16 - 1
-"""Maximum number of values of a known variable: a column has at most 16 address bits, and the top address means a
-missing reading.
+"""Maximum number of values of a known variable.
+
+A column has at most 16 address bits, and the top address stands for a missing reading.
 """
 MAX_ENTRIES: Final = 2**24
 """Maximum number of entries of a factor of a joint distribution (128 MiB as float64)."""
 MAX_TABLE_ENTRIES: Final = 2**26
 """Maximum number of entries of a known variable's table (512 MiB as float64)."""
 MAX_MODEL_ENTRIES: Final = 2**28
-"""Maximum number of entries of the tables of all known variables of a question together."""
+"""Maximum total number of entries in the tables of a question's known variables."""
 
 
 def check_size(what: str, entries: int, most: int, advice: str = "") -> None:
-    """Raise a ModelError for a size above its limit."""
+    """Raise a ModelError if `entries` is larger than `most`. The error names `what`, and ends with `advice`."""
     if entries > most:
         raise ModelError(f"{what} would have {entries} entries; the maximum is {most}{advice}")
 
@@ -52,21 +54,21 @@ class Normal:
     mean: NDArray[np.float64]
     """float64[lines], in the reading's unit."""
     sigma: ArrayLike
-    """Standard deviation, one for all or float64[lines], in the unit of the reading."""
+    """Standard deviation in the unit of the reading: one number for all lines, or float64[lines]."""
     floor: float = 0.0
-    """Probability added to each bin for outliers, as a fraction of the probability of a bin centred at the mean."""
+    """Probability added to each bin for outliers. The unit is the probability of a bin centred at the mean."""
     outliers: float = 0.0
     """Share of readings that do not depend on S."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TabulatedVariable:
-    """A variable with a reading in every frame, a table, and the conversion of readings to addresses."""
+    """A variable that is read in each frame, with its table and the conversion of its readings to addresses."""
 
     name: str
-    """The variable's name: the field in the message, unless `path` is given."""
+    """The variable's name. Without `path`, it is also the name of the field in the message."""
     table: NDArray[np.float64] = field(repr=False)
-    """float64[values, lines]; row k is for the reading with address k."""
+    """float64[values, lines]. Row k belongs to the reading with address k."""
     bits: int = 0
     """Number of address bits. 0 selects the smallest sufficient number.
 
@@ -79,15 +81,15 @@ class TabulatedVariable:
     unit: str = ""
     """The unit of the variable's readings, such as `m`, for display."""
     period: int | None = None
-    """The number of addresses after which the readings repeat (a turn of a bearing), or None."""
+    """Number of addresses in one turn of a cyclic reading, such as a bearing; None for other readings."""
     on_range: Literal["error", "clamp", "missing"] = "error"
-    """Treatment of a reading out of range: an error, the nearest end, or a missing reading."""
+    """What a reading out of range becomes: an error, the nearest end of the range, or a missing reading."""
     on_missing: Literal["error", "missing"] = "error"
     """`missing` if a reading may be missing."""
     path: str = ""
-    """Path of the variable in the message; empty to search the message for the name."""
+    """Path of the variable's field in the message. If it is empty, the message is searched for a field `name`."""
     states: tuple[str, ...] = ()
-    """Names of the values, or none; a reading may be a name."""
+    """Names of the values, or () without names. A reading may be a name instead of a number."""
 
     def _keep_table(self, what: str) -> None:
         """Store a read-only copy of the table, and choose the number of address bits if it is 0."""
@@ -107,7 +109,7 @@ class TabulatedVariable:
         return len(self.table)
 
     def as_variable(self) -> Variable:
-        """Return the conversion of readings to addresses, as in `deployment.toml`, or raise a ModelError."""
+        """Return the variable's entry in `deployment.toml`, or raise a ModelError if the entry would be invalid."""
         own = {each.name for each in fields(self)}
         rule = {key: getattr(self, key) for key in Variable.model_fields if key in own}
         kind = "sensor" if isinstance(self, Known) else "prior_select"
@@ -115,7 +117,7 @@ class TabulatedVariable:
 
 
 def checked_variable(*, name: str, **rule: Any) -> Variable:
-    """Return a variable's entry of `deployment.toml`, or raise a ModelError if it would be invalid."""
+    """Return an entry of `deployment.toml` with the keys `rule`, or raise a ModelError if a key would be invalid."""
     try:
         return Variable(name=name, **rule)
     except ValidationError as reason:
@@ -124,14 +126,15 @@ def checked_variable(*, name: str, **rule: Any) -> Variable:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Known(TabulatedVariable):
-    """A known variable K, a column of the machine: its table is P(K | S), and sums to 1 on each line."""
+    """A known variable K, which has a column in the machine. Its table P(K | S) sums to 1 on each line."""
 
     floor: float = 0.0
-    """The minimum probability of an outlier in the table, relative to the peak of the likelihood; 0 for none.
-    Quantising warns if codes are too coarse for it.
+    """Minimum probability of an outlier in the table, as a fraction of the likelihood's peak, or 0 without a minimum.
+
+    Quantising warns if the codes cannot express the minimum.
     """
     normal: Normal | None = field(default=None, repr=False)
-    """The normals from which the table was computed, or None."""
+    """The normal distributions from which the table was computed, or None if it was not computed from any."""
 
     def __post_init__(self) -> None:
         what = f"P({self.name} | S)"
@@ -141,9 +144,9 @@ class Known(TabulatedVariable):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PriorSelect(TabulatedVariable):
-    """A known variable A that selects the prior (thesis 2.1.2): its table is P(S | A), and each row sums to 1.
+    """A known variable A that selects the prior (thesis 2.1.2). Its table is P(S | A), and each row sums to 1.
 
-    The top row of the prior's table in the machine is the prior without a selection.
+    In the machine, the top row of the prior's table is the prior that applies while A is missing.
     """
 
     def __post_init__(self) -> None:
@@ -160,7 +163,7 @@ class Model:
     name: str
     """Name of the deployment."""
     searched: tuple[Dimension, ...]
-    """The searched variable's dimensions, the slowest-varying first; line = y * width + x for (y, x)."""
+    """The searched variable's dimensions, the slowest-varying first. For (y, x), the line is y * width + x."""
     known: tuple[Known, ...]
     """The known variables in the order of the machine's columns, 1 to N."""
     prior: NDArray[np.float64] | None = None
@@ -169,7 +172,7 @@ class Model:
     None means a uniform prior. With `prior_select`, None means the mean of the rows of the prior table.
     """
     prior_select: PriorSelect | None = None
-    """The variable that selects the prior; if there is one, `prior` applies while nothing is selected."""
+    """The variable that selects the prior, or None. With a variable, `prior` applies while its reading is missing."""
     transition: Transition | None = None
     """The transition of the searched variable between frames, or None without a filter.
 
@@ -233,7 +236,7 @@ class Model:
         )
 
     def with_bits(self, bits: Mapping[str, int]) -> Self:
-        """Return the model with the address bits of some known variables, by name, or raise a ModelError."""
+        """Return the model with these numbers of address bits, by the variable's name, or raise a ModelError."""
         select = self.prior_select
         return replace(
             self,
@@ -260,7 +263,7 @@ class Model:
 
     @property
     def variables(self) -> tuple[Variable, ...]:
-        """All known variables as in `deployment.toml`: the columns, then the one that selects the prior."""
+        """All known variables as entries of `deployment.toml`: the columns, then the variable that selects the prior."""
         return tuple(known.as_variable() for known in self._all_known())
 
     @property
@@ -299,14 +302,14 @@ def dimension(
 
 
 def cell_centres(*searched: Dimension) -> tuple[NDArray[np.float64], ...]:
-    """Return the value of each dimension at the centre of every line's cell: float64[lines] per dimension."""
+    """Return the centres of the cells of all lines: the values of each dimension, as float64[lines] per dimension."""
     check_size("the grid of cells", math.prod(each.size for each in searched), MAX_LINES)
     axes = [d.offset + np.arange(d.size) * d.step for d in searched]
     return tuple(axis.ravel() for axis in np.meshgrid(*axes, indexing="ij"))
 
 
 def check_table(what: str, values: int, lines: int) -> None:
-    """Raise a ModelError for a known variable's table that would be too large."""
+    """Raise a ModelError if a known variable's table with `values` rows and `lines` columns would be too large."""
     if values > MAX_VALUES:
         raise ModelError(
             f"{what} has {values} values; a column supports at most {MAX_VALUES}: use a larger step"
@@ -373,10 +376,10 @@ def exact_posterior(
 
 
 def fuse(prior: NDArray[np.float64], likelihoods: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:
-    """Return the normalised product of a prior and likelihoods, float64[lines]; each may have any scale.
+    """Return the normalised product of a prior and likelihoods, float64[lines]. The factors may have any scale.
 
-    The product is computed as a sum of logarithms, so that many small likelihoods don't underflow. If it is 0 on every
-    line, a ModelError is raised.
+    The product is computed as a sum of logarithms, so that many small likelihoods don't underflow. Raises a ModelError
+    if the product is 0 on every line.
     """
     with np.errstate(divide="ignore"):  # log 0 = -inf is an impossible line
         logarithm = np.log(prior)
