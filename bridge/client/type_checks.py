@@ -1,6 +1,6 @@
-"""Checks of the data that a client sends against the definitions of their types, which rosapi knows.
+"""Checks of the data that a client sends. A check compares data with the definition of their ROS type.
 
-rosapi is a node that runs beside most rosbridge servers, and answers service calls below `/rosapi`.
+rosapi, a node beside most rosbridge servers, sends the definitions. Its services have names below `/rosapi`.
 """
 
 import asyncio
@@ -30,7 +30,7 @@ _Part = Literal["service_request", "service_response", "action_goal", "action_re
 
 
 class TypeChecks:
-    """The type checks of the data that one client sends. A rosapi that does not answer is asked once per connection."""
+    """The type checks of one client's data. If rosapi does not answer, it is not asked again on this connection."""
 
     def __init__(self, session: Session) -> None:
         self._session = session
@@ -91,7 +91,7 @@ class TypeChecks:
             _apply(check, goal, f"a goal of {action}")
 
     async def part(self, part: _Part, type_name: str, limit: float = _ROSAPI_TIMEOUT) -> MessageCheck | None:
-        """Return the check of a request, answer, goal, result or feedback; None for a type unknown to the server."""
+        """Return the check of a request, answer, goal, result or feedback, or None if its type is unknown."""
         async with self._asking:
             key = part, type_name
             if key not in self._parts and self._may_ask():

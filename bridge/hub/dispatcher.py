@@ -14,7 +14,7 @@ from bridge.hub.limits import HubLimits, RefusedOperationError
 from bridge.hub.outbox import Lane
 
 SMALLEST_FRAGMENT: Final = 256
-"""Minimum size of a fragment in bytes; smaller ones would consist mostly of framing."""
+"""Minimum size of a fragment in bytes. A smaller fragment would consist mostly of framing."""
 # Maximum number of status messages queued for a client.
 _STATUS_QUEUE: Final = 20
 
@@ -41,7 +41,7 @@ class Dispatcher:
             self._ready.append(client)
 
     def take_ready(self) -> list[Client]:
-        """Return the clients that have had output, or must be closed, since the last call."""
+        """Return the clients marked as ready since the last call. Each has output, or must be closed."""
         ready, self._ready = self._ready, []
         for client in ready:
             client.is_ready = False
@@ -57,7 +57,7 @@ class Dispatcher:
         return payload
 
     def send(self, client: Client, payload: bytes, *, fragment_size: int = 0, png: bool = False) -> None:
-        """Queue a message that must not be dropped, in the encoding that was requested."""
+        """Queue a message for a client, as PNG or in fragments if requested. The message is never dropped."""
         self.work += len(payload) >> 6
         if png:
             payload = self.as_png(payload)
@@ -67,12 +67,12 @@ class Dispatcher:
         self.mark_ready(client)
 
     def as_png(self, payload: bytes) -> bytes:
-        """Return an operation as a PNG picture, or unchanged if the picture exceeds the limit and would be lost."""
+        """Return an operation as a PNG picture, or unchanged if the picture would exceed the size limit."""
         wrapped = as_png(payload)
         return wrapped if len(wrapped) <= self._limits.message_bytes else payload
 
     def offer(self, client: Client, lane: Lane, payload: bytes, now: float) -> None:
-        """Queue a message that newer messages of its lane may replace."""
+        """Queue a message in a lane. Newer messages in the lane may replace the message."""
         client.outbox.offer(lane, payload, now)
         if lane.throttle:
             self.schedule_release(client)
@@ -83,14 +83,14 @@ class Dispatcher:
         self.deadline = min(self.deadline, deadline)
 
     def schedule_release(self, client: Client) -> None:
-        """Schedule the release of a client's held messages."""
+        """Schedule the release of the messages that a throttle holds back for a client."""
         deadline = client.outbox.deadline
         if deadline != inf:
             self.throttled.add(client)
             self.schedule(deadline)
 
     def release(self, now: float) -> float:
-        """Queue the messages that throttles admit at `now`, and return the time at which the next one is admitted."""
+        """Queue the messages that throttles admit at `now`. Returns the time of the next admission, or infinity."""
         for client in [client for client in self.throttled if client.outbox.deadline <= now]:
             client.outbox.release(now)
             self.mark_ready(client)
@@ -114,5 +114,5 @@ class Dispatcher:
 
 
 def fragment_size_of(requested: float) -> int:
-    """Return the fragment size to use when a client requests this one; 0 means whole messages."""
+    """Return the fragment size for a client's request, at least `SMALLEST_FRAGMENT`. 0 means whole messages."""
     return max(int(requested), SMALLEST_FRAGMENT) if requested else 0

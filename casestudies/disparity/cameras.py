@@ -1,4 +1,4 @@
-"""Simulated stereo cameras: the pairs of a rendered scene as images on two topics, and the true disparity."""
+"""Simulated stereo cameras. They publish rendered pairs of images on two topics, and the true disparity on a third."""
 
 import asyncio
 import time
@@ -20,7 +20,7 @@ from terminal.signals import run_async
 async def publish_pairs(
     uri: str, *, seed: int, rate: float, width: int, height: int, count: int | None = None
 ) -> None:
-    """Publish `count` pairs, or pairs until cancelled; raise a BridgeError if no server answers at the URI."""
+    """Publish `count` pairs, or endlessly if `count` is None. Raises a BridgeError if no server answers."""
     from bridge.stamps import header
     from casestudies.topics import LossyPublication, connected
 

@@ -1,6 +1,6 @@
-"""The host's computations: filters of images, matching costs, likelihoods, and fusion in float64 (thesis 4.4).
+"""The host's computations: image filters, matching costs and likelihoods, and fusion in float64 (thesis 4.4).
 
-Everything is computed for all pixels and disparities at once. A cost volume is float32[disparities, height, width].
+Each function computes all pixels and disparities at once.
 """
 
 from typing import Final
@@ -9,22 +9,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 FILTERS: Final = ("gradient_x", "gradient_y", "surround")
-"""The sensors of the machine, one for each filter.
+"""The image filters. The machine has one sensor for each filter.
 
-They are the derivatives across and down, and the difference between a small and a large surround (a Laplacian). None of
-the filters responds to a difference in brightness between the cameras, and their noise is nearly independent, as naive
-fusion assumes.
+Two filters are the derivatives across and down. `surround` is the mean of a small window minus the mean of a large
+window (a Laplacian). No filter responds to a difference in brightness between the cameras. The noise of the filters is
+nearly independent, as naive fusion assumes.
 """
 SCALES: Final = (2.0, 2.0, 4.0)
 """Mean matching cost of each filter at the true disparity, in grey levels."""
 OUTLIER: Final = 0.05
-"""Likelihood added to every cost at the true disparity, relative to that of cost 0, for occlusions and reflections."""
+"""Minimum likelihood of a cost, relative to the likelihood of cost 0. This allows for occlusions and reflections."""
 WINDOW: Final = 2
-"""Pixels on each side of a pixel over which a cost is averaged."""
+"""Number of pixels from the centre to the edge of the window in which costs are averaged."""
 
 
 def box_sum(values: NDArray[np.float32], reach: int) -> NDArray[np.float32]:
-    """Return sums over windows of 2 * reach + 1 values in each of the last two dimensions, cut off at the borders."""
+    """Return, for each pixel, the sum over a square window of side 2 * reach + 1, cut off at the image's borders."""
     for axis in (-1, -2):
         size = values.shape[axis]
         zero = np.zeros_like(np.take(values, [0], axis))
@@ -37,9 +37,9 @@ def box_sum(values: NDArray[np.float32], reach: int) -> NDArray[np.float32]:
 
 
 def filtered(image: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Return the filters' outputs, float32[filters, height, width], for an image, uint8[height, width].
+    """Return the output of each filter, float32[filters, height, width], for an image uint8[height, width].
 
-    Beyond the border, the image's edge pixels are repeated.
+    For the derivatives, the edge pixels are repeated beyond the border.
     """
     padded = np.pad(image.astype(np.float32), 1, mode="edge")
     across = padded[:, 2:] - padded[:, :-2]
@@ -58,9 +58,10 @@ def filtered(image: NDArray[np.uint8]) -> NDArray[np.float32]:
 def matching_costs(
     left: NDArray[np.uint8], right: NDArray[np.uint8], disparities: int
 ) -> NDArray[np.float32]:
-    """Return costs of the left image: float32[filters, disparities, height, width].
+    """Return the matching costs of the left image, float32[filters, disparities, height, width].
 
-    A cost is the mean of |left(x, y) - right(x - d, y)| over a window. Where x - d lies beyond the border, it is NaN.
+    A cost at disparity d is the mean of |left(x, y) - right(x - d, y)| over a window, for the filtered images. If x - d
+    lies beyond the border, the cost is NaN.
     """
     ours, theirs = filtered(left), filtered(right)
     height, width = left.shape
@@ -84,12 +85,12 @@ def likelihoods(costs: NDArray[np.float32]) -> NDArray[np.float32]:
 
 
 def as_bytes(likely: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """Return likelihoods as bytes for the machine, scaled so that the likeliest disparity of each pixel has 255."""
+    """Return likelihoods as bytes for the machine. In each filter, the likeliest disparity of a pixel gets 255."""
     codes: NDArray[np.uint8] = np.rint(likely * (255 / likely.max(axis=1, keepdims=True))).astype(np.uint8)
     return codes
 
 
 def fused(likely: NDArray[np.float32] | NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Return the posterior in float64, float64[disparities, height, width]: the product over filters, normalised."""
+    """Return the posterior, float64[disparities, height, width]: the normalised product of the filters' likelihoods."""
     product = likely.astype(np.float64).prod(axis=0)
     return np.asarray(product / product.sum(axis=0))

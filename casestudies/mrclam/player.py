@@ -1,4 +1,4 @@
-"""A recording of a robot among landmarks, and its player, which compares posteriors with the reference.
+"""Player of a robot's recorded sightings of landmarks. It compares posteriors with the robot's reference positions.
 
 python -m casestudies.mrclam.player DATA_DIR/ds1_robot3.csv --uri ws://127.0.0.1:9090
 """
@@ -47,23 +47,23 @@ _REFERENCE_COLUMNS: Final = ("ref_x_m", "ref_y_m")
 
 
 def area_grid(width: int = 32, height: int = 32) -> Grid:
-    """Return the area of the experiment, x in [-2, 7] m and y in [-7, 7] m, as a grid of cells."""
+    """Return the grid of cells over the experiment's area: x in [-2, 7] m, y in [-7, 7] m."""
     return Grid(x_low=-2.0, x_high=7.0, y_low=-7.0, y_high=7.0, width=width, height=height)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedFrame:
-    """The sightings of one second, and the robot's reference position in metres."""
+    """A robot's sightings of landmarks in one second, and the robot's reference position in metres."""
 
     number: int
     x: float
     y: float
     readings: Mapping[str, float]
-    """Ranges in metres and absolute bearings in radians of the landmarks that were seen, by names such as `range_6`."""
+    """Ranges in metres and absolute bearings in radians of the seen landmarks. Keys are names such as `range_6`."""
 
 
 def read_recording(path: Path) -> tuple[RecordedFrame, ...]:
-    """Read a file such as `ds1_robot3.csv`, or raise a ModelError that names the wrong row or column."""
+    """Return the frames of a file such as `ds1_robot3.csv`. A ModelError names the wrong row or column."""
     pairs = {landmark: (f"range_{landmark}_m", f"bearing_{landmark}_rad") for landmark in LANDMARKS}
     columns = recording.read_recording(path, (*_REFERENCE_COLUMNS, *chain(*pairs.values()))).columns
     frames = []
@@ -88,14 +88,14 @@ def read_recording(path: Path) -> tuple[RecordedFrame, ...]:
 
 
 LOST_DISTANCE: Final = 9.0
-"""Distance in metres with which a frame without a result enters the median: the width of the area."""
+"""Distance in metres that counts for a frame without a result. It equals the width of the area."""
 _REPEAT_S: Final = 1.0
 """Seconds between publications of the first frame, until its result arrives."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlayedFrame:
-    """A recorded frame and its result: the published posterior, or the reason why there is none."""
+    """A recorded frame with its published posterior, or with the reason why it has no posterior."""
 
     frame: RecordedFrame
     posterior: Posterior | None = None
@@ -103,7 +103,10 @@ class PlayedFrame:
     outcome: str
 
     def estimate(self) -> tuple[float, float] | None:
-        """Return the posterior's mean (x, y) in metres, or raise a BadResultError if its axes are not y and x."""
+        """Return the posterior's mean (x, y) in metres, or None without a posterior.
+
+        Raises a BadResultError if the posterior does not have two axes, y and x.
+        """
         if self.posterior is None:
             return None
         if len(self.posterior.sizes) != 2:
@@ -115,13 +118,13 @@ class PlayedFrame:
         return area_grid(width, height).mean(self.posterior.probabilities)
 
     def distance(self) -> float:
-        """Return the distance from the estimate to the reference, in metres; `LOST_DISTANCE` without an estimate."""
+        """Return the distance in metres from the estimate to the reference, or `LOST_DISTANCE` without an estimate."""
         estimate = self.estimate()
         return LOST_DISTANCE if estimate is None else math.dist(estimate, (self.frame.x, self.frame.y))
 
 
 def median_distance(played: Sequence[PlayedFrame]) -> float:
-    """Return the median distance to the reference position over all frames, in metres."""
+    """Return the median of the frames' distances to the reference position, in metres."""
     return median(frame.distance() for frame in played)
 
 

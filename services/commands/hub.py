@@ -1,4 +1,4 @@
-"""The command `hub`: the embedded rosbridge server with status socket, metrics and announcement."""
+"""The command `hub`: the embedded rosbridge server, with a status socket, metrics and a network announcement."""
 
 import asyncio
 import logging

@@ -1,8 +1,8 @@
-"""Admission of requests by host, origin and token, for pages and sockets alike.
+"""Admission of requests for pages and WebSockets by host, origin and token.
 
     request ──▶ host? ──▶ origin? ──▶ token? ──▶ page, socket
 
-A browser sends the token once, as `/?token=TOKEN`, and gets it back as a cookie that scripts cannot read.
+A browser sends the token once, as `/?token=TOKEN`. The server returns the token in a cookie that scripts cannot read.
 """
 
 import ipaddress
@@ -69,7 +69,7 @@ class Doors:
             await self._app(scope, receive, _with_headers(send))
 
     def refusal(self, headers: Headers, token: str = "") -> HTTPStatus | None:
-        """Return the status that refuses a request with these headers, or None to admit it."""
+        """Return the HTTP status with which to refuse a request with these headers, or None to admit the request."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not self._is_our_name(hosts[0]):
             return HTTPStatus.FORBIDDEN

@@ -1,4 +1,4 @@
-"""Inspection of a BM1's deployment: losses, accuracy, cycles, resources and energy, as text or as a JSON object."""
+"""Inspection of a BM1's deployment: quantisation losses, accuracy, cycles, resources and energy, as text or JSON."""
 
 import json
 from dataclasses import asdict, dataclass, replace
@@ -33,10 +33,10 @@ from toolchain.outputs.mif import table_length
 FRAMES: Final = 200
 BANKS: Final = 4
 SLOW_FRAMES: Final = 20
-"""Number of frames for machines that are slow to emulate: with one generator per cell, or without LFSRs."""
+"""Default number of frames for a slow machine: a machine with one generator per cell, or without LFSRs."""
 LEAST_FRAMES: Final = 20
 SLOW_LEAST_FRAMES: Final = 3
-"""Minimum number of frames for slow machines with replicas; `SLOW_FRAMES` is divided by the number of replicas."""
+"""For a slow machine with replicas, the default is `SLOW_FRAMES` divided by their number, but at least this."""
 SLOW_BANKS: Final = 1
 
 
@@ -57,7 +57,7 @@ class Inspection:
 def inspect_deployment(
     deployment: Deployment, model: Model | None, options: InspectOptions, progress: Progress, run: Run
 ) -> Inspection:
-    """Run the machine of a deployment on readings, and estimate its costs, or raise a ToolchainError."""
+    """Emulate a deployment's machine on readings, and estimate its resources and energy, or raise a ToolchainError."""
     device = device_named(options.device)
     machines = tuple(image.machine for image in read_images(deployment))
     whole = joined(machines)

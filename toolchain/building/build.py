@@ -67,14 +67,14 @@ from toolchain.outputs.output_files import (
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Built:
-    """A deployment, the images (programming files) of its boards, and the report of the build."""
+    """The result of a build: a deployment, the images (programming files) of its boards, and the report."""
 
     deployment: Deployment
     """The content of `deployment.toml`."""
     images: tuple[Image, ...]
     """One per board."""
     quantised: Quantised | None
-    """The codes of a BM1 before they were divided among boards, and the quantisation loss; None for a BM2."""
+    """The codes of a BM1 before the division among boards, and the quantisation loss, or None for a BM2."""
     report: str
     """The content of `report.txt`."""
     transition: Transition | None = None
@@ -172,10 +172,10 @@ def assemble(
 
 
 def build_date(model_file: Path) -> str:
-    """Return the build date for this model file, ISO 8601 in UTC.
+    """Return the build date for a model file, in ISO 8601 and UTC.
 
-    It is `SOURCE_DATE_EPOCH` if set, otherwise the modification time of the file, so the same input gives the
-    same bytes. A BuildError if `SOURCE_DATE_EPOCH` is not a time.
+    The date is `SOURCE_DATE_EPOCH` if set, otherwise the modification time of the file. So equal input gives equal
+    bytes. Raises a BuildError if `SOURCE_DATE_EPOCH` is not a time.
     """
     epoch = os.environ.get("SOURCE_DATE_EPOCH")
     try:
@@ -266,10 +266,10 @@ def describe(plan: MachinePlan | BM2Plan, layout: BoardLayout, images: Sequence[
 
 
 def known_variables(plan: MachinePlan | BM2Plan) -> tuple[Variable, ...]:
-    """Return the known variables as a deployment has them, with their sources and paths in messages.
+    """Return the known variables of the deployment, with their sources and paths in messages.
 
-    With `--sensor-mode threshold`, the values of a sensor are codes. A BuildError is raised if `--order`, `--path` or
-    a sources file names a variable that the model does not have.
+    With `--sensor-mode threshold`, the values of a sensor are codes. Raises a BuildError if `--order`, `--path` or a
+    sources file names a variable that the model does not have.
     """
     options, variables = plan.options, plan.model.variables
     variables = variables if options.sources is None else options.sources.place(variables)
@@ -294,14 +294,14 @@ def known_variables(plan: MachinePlan | BM2Plan) -> tuple[Variable, ...]:
 
 
 def read_images(deployment: Deployment) -> list[Image]:
-    """Read the image of each board, and return them in the order of the boards."""
+    """Read the image of each board. Returns the images in the order of the boards."""
     return [read_image(deployment.image_path(board)) for board in range(len(deployment.boards))]
 
 
 def check_agreement(
     deployment: Deployment, images: Sequence[Image], *, edited: Container[str] = frozenset()
 ) -> None:
-    """Raise a DeploymentError if `deployment.toml` contradicts its images, except in the keys that `edited` names."""
+    """Raise a DeploymentError if `deployment.toml` contradicts its images. Keys in `edited` are not compared."""
     machine = deployment.machine
     total = machine.lines if machine.is_divided else len(images)
     for index, (board, image) in enumerate(zip(deployment.boards, images, strict=True)):

@@ -1,4 +1,4 @@
-"""Readers of network files: BIF, XMLBIF, UAI, NET and XDSL, also compressed (.gz), become joint distributions."""
+"""Readers of Bayesian network files. A BIF, XMLBIF, UAI, NET or XDSL file (also .gz) becomes a joint distribution."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from toolchain.models.joint import JointDistribution
 
 MAX_BYTES: Final = 32 << 20
-"""Maximum size of a file in bytes, compressed or not."""
+"""Maximum size of a network file in bytes. The limit holds before and after decompression."""
 
 _READERS: Final = {
     ".bif": "text_formats.read_bif",
@@ -33,7 +33,7 @@ SUFFIXES: Final = tuple(_READERS)
 
 
 def is_network(path: Path) -> bool:
-    """Return whether a path has the suffix of a network file."""
+    """Return whether a path ends in one of `SUFFIXES`, with or without `.gz`."""
     return _suffix(Path(path)) in SUFFIXES
 
 

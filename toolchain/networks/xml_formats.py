@@ -23,13 +23,13 @@ _DECIMAL: Final = re.compile(r"[+-]?(\d+(\.\d*)?|\.\d+)([eE][+-]?\d+)?", re.ASCI
 
 @dataclass(frozen=True, slots=True)
 class XmlLine:
-    """A line of an XML file, for errors."""
+    """A line of an XML file, to be named in errors."""
 
     path: Path
     number: int
 
     def error(self, sentence: str) -> NetworkFileError:
-        """Return an error that starts with the file and the line, followed by the sentence."""
+        """Return an error that names the file and the line, and then contains `sentence`."""
         return NetworkFileError(sentence, path=self.path, line=self.number)
 
 
@@ -52,7 +52,7 @@ def _decimals(words: Sequence[str], child: str, line: XmlLine) -> NDArray[np.flo
 
 @dataclass(slots=True)
 class Element:
-    """An element of an XML file. `text` is the text after its last child, or all its text if it has no children."""
+    """An element of an XML file. `text` is the text after the last child, or all text if there are no children."""
 
     name: str
     attributes: dict[str, str]
@@ -70,7 +70,7 @@ class Element:
         return [child.text for child in self.named(name)]
 
     def only(self, name: str) -> str:
-        """Return the text of the only child with this name, or raise a NetworkFileError."""
+        """Return the text of the only child with this name, or raise a NetworkFileError if there is not exactly one."""
         found = self.texts(name)
         if len(found) != 1:
             raise self.end.error(f"there are {len(found)} elements {name}, expected one")
@@ -78,7 +78,7 @@ class Element:
 
 
 def read_xml(data: bytes, path: Path, root: str) -> Element:
-    """Return the root of an XML file without entities; errors are NetworkFileErrors with the line."""
+    """Return the root element. Raises a NetworkFileError with the line if the XML is invalid or has entities."""
     parser = expat.ParserCreate()
     parser.buffer_text = True
     top = Element("", {}, XmlLine(path, 1), XmlLine(path, 1))
@@ -131,9 +131,10 @@ _XDSL_NODES: Final = {"cpt": "probabilities", "deterministic": "resultingstates"
 
 
 def read_xdsl(data: bytes, builder: NetworkBuilder) -> None:
-    """Read an XDSL file; in `probabilities`, the first parent varies slowest and the child fastest.
+    """Read an XDSL file into `builder`.
 
-    `resultingstates` of a deterministic node has one state for each combination of its parents.
+    In `probabilities`, the first parent varies slowest, and the child varies fastest. `resultingstates` of a
+    deterministic node names one state for each combination of the parents' states.
     """
     smile = read_xml(data, builder.path, "smile")
     builder.name(smile.attributes.get("id", ""))
@@ -175,7 +176,7 @@ def _xdsl_table(builder: NetworkBuilder, node: Element) -> None:
 
 
 def read_xmlbif(data: bytes, builder: NetworkBuilder) -> None:
-    """Read an XMLBIF file without entities; in a TABLE, the GIVENs are in order and the FOR varies fastest."""
+    """Read an XMLBIF file into `builder`. In a TABLE, the first GIVEN varies slowest, and the FOR varies fastest."""
     parts = [
         part for network in read_xml(data, builder.path, "BIF").named("NETWORK") for part in network.children
     ]

@@ -1,7 +1,7 @@
-"""The protocol state of a client: its requests to the server, and the decoding of the server's messages.
+"""The protocol state of a client. It encodes messages to the server, and decodes messages from the server.
 
-Outgoing messages are collected in an outbox, which the session empties with `ClientCore.data_to_send`.
-Nothing is collected without a connection.
+Outgoing messages wait in an outbox until the client's `Session` takes them with `ClientCore.data_to_send`.
+Without a connection, the outbox stays empty.
 """
 
 from typing import Any
@@ -21,8 +21,8 @@ from bridge.names import RosVersion
 class ClientCore:
     """State of a rosbridge client.
 
-    Each advertisement, subscription and request has a number that is never reused, so a late event cannot reach a newer
-    object.
+    Each advertisement, subscription and request has a number that is never reused. So a late event about an ended
+    subscription, for example, cannot reach a newer subscription.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class ClientCore:
         return self.wire.ros_version or self.subscriptions.seen_version
 
     def restore(self) -> None:
-        """Start a new connection: put all registrations into the outbox, advertisements first."""
+        """Begin a new connection: put all advertisements, services, actions and subscriptions into the outbox."""
         self.wire.connected = True
         self.wire.clear()
         # Advertisements first, so that the program can publish as soon as its first message arrives.
@@ -58,7 +58,7 @@ class ClientCore:
         self.subscriptions.restore()
 
     def lost(self) -> None:
-        """Drop calls, goals and requests of a lost connection."""
+        """After a connection was lost, drop the outbox and all unanswered calls, goals and requests."""
         self.wire.connected = False
         self.wire.clear()
         self.calls.lost()
