@@ -15,7 +15,7 @@ _SEQUENCER_STEPS = 16
 
 
 class ReferenceBM2(BM2Kernel):
-    """A kernel for any machine that runs cycle by cycle (thesis 2.1.3, figure 2.9)."""
+    """A kernel for any BM2. It computes one cycle at a time (thesis 2.1.3, figure 2.9)."""
 
     def __init__(self, machine: BM2Machine) -> None:
         super().__init__(machine)
@@ -30,7 +30,7 @@ class ReferenceBM2(BM2Kernel):
 
     @property
     def stream(self) -> npt.NDArray[np.uint32]:
-        """A copy of the stream's buffer: uint32[samples since the last start or resume, state_words]."""
+        """A copy of the stream's buffer, uint32[samples, state_words]: all samples since the last start or resume."""
         words = self._parameters.state_words
         packed = b"".join(state.to_bytes(4 * words, "little") for state in self._stream)
         return np.frombuffer(packed, "<u4").astype(np.uint32).reshape(-1, words)

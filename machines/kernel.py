@@ -1,4 +1,4 @@
-"""The common base of the kernels of a BM1, and the checks of their arguments."""
+"""The base class of all BM1 kernels, and the checks of the values that start or resume a frame."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Collection
@@ -28,17 +28,17 @@ class BM1Kernel(ABC):
 
     @property
     def cycles(self) -> int:
-        """Cycles that the generators have run in this frame: as many as the longest-running replica."""
+        """Number of cycles that the generators have run in this frame: the maximum of `replica_cycles`."""
         return max(self._cycles)
 
     @property
     def reason(self) -> StopReason:
-        """The reason why the machine stopped: the `joint_reason` of its replicas."""
+        """The reason why the machine stopped. `joint_reason` computes it from the reasons of the replicas."""
         return joint_reason(self._reasons, self._halted)
 
     @property
     def replica_cycles(self) -> tuple[int, ...]:
-        """Cycles that each replica ran in this frame."""
+        """Number of cycles that each replica has run in this frame."""
         return tuple(self._cycles)
 
     @property
@@ -49,22 +49,22 @@ class BM1Kernel(ABC):
     @property
     @abstractmethod
     def counts(self) -> npt.NDArray[np.uint32]:
-        """A copy of the counters: uint32[lines], with several replicas uint32[replicas, lines]."""
+        """A copy of the counters: uint32[lines], or uint32[replicas, lines] with several replicas."""
 
     @property
     @abstractmethod
     def rng_state(self) -> npt.NDArray[np.uint64]:
-        """A copy of the generators' states: uint64[columns], or uint64[lines, columns] if unshared."""
+        """A copy of the generators' states: uint64[columns], or uint64[lines, columns] with a generator per cell."""
 
     def reset(self) -> None:
-        """Set counters and cycles to 0 and reasons to `NONE`, and restart the generators from bank 0."""
+        """Set all counters and cycles to 0 and all stop reasons to `NONE`. Restart the generators from bank 0."""
         self._reset()
         self._cycles = [0] * len(self._cycles)
         self._reasons = [StopReason.NONE] * len(self._reasons)
         self._halted = set()
 
     def prepare(self) -> None:
-        """Do in advance the work that would slow down the first frames, and reset the machine."""
+        """Do the work that would otherwise slow down the first frames, and reset the machine."""
         self.reset()
 
     def start(self, start: Start) -> StopReason:
@@ -198,6 +198,6 @@ def _check_inputs(parameters: BM1Parameters, given: object) -> None:
 
 
 def check_start_value(name: str, value: object, lowest: int, highest: int) -> None:
-    """Refuse a value that is not an integer from `lowest` to `highest`."""
+    """Raise a StartError unless `value` is an integer from `lowest` to `highest`."""
     value = int(value) if isinstance(value, np.integer) else value
     check_parameter(name, value, lowest, highest, StartError)

@@ -22,10 +22,10 @@ Words: TypeAlias = npt.NDArray[np.uint64]
 RngParameters: TypeAlias = BM1Parameters | BM2Parameters
 
 GOLDEN: Final = 0x9E3779B97F4A7C15
-"""2**64 divided by the golden ratio, rounded to an odd number: its multiples are evenly spread."""
+"""2**64 divided by the golden ratio, rounded to an odd number. Its multiples modulo 2**64 are evenly spread."""
 
 BASE_STATE: Final = 0x2545F4914F6CDD1D
-"""The low bits of this number are the base state from which each LFSR's seeds are computed."""
+"""The base state of an LFSR is the low bits of this number. `LFSR.seeds` derives all seeds from the base state."""
 
 POLYNOMIALS: Final = {
     RngKind.LFSR8: (8, 6, 5, 4),
@@ -33,20 +33,20 @@ POLYNOMIALS: Final = {
     RngKind.LFSR24: (24, 23, 22, 17),
     RngKind.LFSR32: (32, 22, 2, 1),
 }
-"""Non-zero exponents of the maximal-length polynomial of each LFSR, in descending order."""
+"""For each LFSR, the non-zero exponents of its maximal-length polynomial, in descending order."""
 
 
 class RandomNumbers(Protocol):
-    """All generators of a machine; arrays of states have one element per generator."""
+    """All generators of a machine. An array of states has one element per generator."""
 
     def restart(self, bank: int) -> Words:
-        """Return the states at the start of a bank, in the parameters' `generator_shape`."""
+        """Return the initial state of each generator for a seed bank: uint64[`generator_shape`]."""
 
     def show(self, states: Words) -> Words:
-        """Return the outputs for these states, `prob_bits` bits each."""
+        """Return the random numbers that generators in these states output, with `prob_bits` bits each."""
 
     def clock(self, states: Words) -> Words:
-        """Return the states after one clock, which is `steps_per_clock` steps."""
+        """Return the states after one clock. In one clock, each generator makes `steps_per_clock` steps."""
 
 
 def random_numbers(machine: BM1Machine | BM2Machine) -> RandomNumbers:
@@ -60,12 +60,12 @@ def random_numbers(machine: BM1Machine | BM2Machine) -> RandomNumbers:
 
 
 def seed_set(parameters: RngParameters, bank: int) -> int:
-    """Return the index of the seed set that this board uses for a bank; the boards of a BM2 never share a set."""
+    """Return the index of the seed set that a board uses for a bank. The boards of a BM2 use different seed sets."""
     return bank * parameters.chains + parameters.chain
 
 
 def generator_numbers(parameters: RngParameters, bank: int) -> Words:
-    """Return the serial numbers of a bank's generators: uint64[`generator_shape`]."""
+    """Return the serial number of each generator in a bank: uint64[`generator_shape`]."""
     count = math.prod(parameters.generator_shape)
     first = seed_set(parameters, bank) * count
     return np.arange(first, first + count, dtype=np.uint64).reshape(parameters.generator_shape)
@@ -93,7 +93,7 @@ class LFSR:
 
     @property
     def taps(self) -> int:
-        """Mask of the state bits whose parity is shifted in."""
+        """Mask of the tapped state bits. A step shifts the parity of these bits into the state."""
         return sum(1 << (exponent - 1) for exponent in POLYNOMIALS[self.kind])
 
     def step(self, states: Words) -> Words:
@@ -102,7 +102,7 @@ class LFSR:
         return ((states << np.uint64(1)) & np.uint64(self.period)) | parity
 
     def jump(self, states: Words, steps: Words) -> Words:
-        """Return each state after its own number of steps, found with a few table look-ups."""
+        """Advance `states[i]` by `steps[i]` steps, for every i, with a few table look-ups instead of single steps."""
         steps = steps % np.uint64(self.period)
         for bit, tables in enumerate(jump_tables(self.kind, 1)):
             taken = (steps >> np.uint64(bit)) & np.uint64(1) == 1
@@ -123,7 +123,7 @@ class LFSR:
 
 
 def sequencer_seed(parameters: BM2Parameters, bank: int) -> int:
-    """Return a bank's seed for the LFSR16 of a BM2's sequencer, which draws the random order of the bits."""
+    """Return a bank's seed for the LFSR16 in a BM2's sequencer. A `random` sequencer chooses bits with this LFSR."""
     return int(LFSR(RngKind.LFSR16).seeds(np.array([seed_set(parameters, bank)], dtype=np.uint64))[0])
 
 
@@ -134,7 +134,7 @@ def _seeds(kind: RngKind, first: int, count: int) -> Words:
 
 @dataclass(frozen=True, slots=True)
 class LFSRNumbers:
-    """LFSRs, which output the low bits of their states."""
+    """LFSRs as generators. The output of an LFSR is the low bits of its state."""
 
     parameters: RngParameters
 
@@ -157,17 +157,17 @@ class LFSRNumbers:
 
 @dataclass(frozen=True, slots=True)
 class TableNumbers:
-    """Generators that all repeat one table of recorded numbers; a state is an index.
+    """Generators that repeat one table of recorded numbers. A state is an index into the table.
 
-    In seed set 0, generator n of `count` starts at index floor(n * length / count). In seed set s of `sets`, it starts
-    later by s / sets of the distance to the next generator's start.
+    In seed set 0, generator n of `count` starts at index floor(n * length / count). Seed set s of `sets` shifts every
+    start by the fraction s / sets of the distance to the next generator's start.
     """
 
     parameters: RngParameters
     table: npt.NDArray[np.uint32]
 
     def restart(self, bank: int) -> Words:
-        """Return the generators' first indices in the seed set `bank`."""
+        """Return the index at which each generator starts in a bank: uint64[`generator_shape`]."""
         shape, sets = self.parameters.generator_shape, self.parameters.rng_banks * self.parameters.chains
         count, own = math.prod(shape), seed_set(self.parameters, bank)
         # Python integers, because the products may exceed 64 bits
@@ -175,7 +175,7 @@ class TableNumbers:
         return np.array(starts, dtype=np.uint64).reshape(shape)
 
     def show(self, states: Words) -> Words:
-        """Return the low `prob_bits` bits of the table's numbers."""
+        """Return the low `prob_bits` bits of the table's numbers at these indices."""
         return self.table[states] & np.uint64(self.parameters.ones_code)
 
     def clock(self, states: Words) -> Words:
@@ -185,10 +185,10 @@ class TableNumbers:
 
 @dataclass(frozen=True, slots=True)
 class IdealNumbers:
-    """Nearly ideal generators, for comparison: splitmix64 of the seed, the generator and the step.
+    """Nearly ideal generators (splitmix64), for comparison with LFSRs.
 
     The state of the generator with serial number n starts at mix(mix(`ideal_seed`) + (n + 1) * GOLDEN). A step adds
-    GOLDEN, and the output is mix(state), all modulo 2**64.
+    GOLDEN to the state. The output is mix(state). All sums are modulo 2**64.
     """
 
     parameters: RngParameters
@@ -200,7 +200,7 @@ class IdealNumbers:
         return mix(seed + (numbers + np.uint64(1)) * np.uint64(GOLDEN))
 
     def show(self, states: Words) -> Words:
-        """Return the low `prob_bits` bits of the mixed states."""
+        """Return the low `prob_bits` bits of mix(state) for each state."""
         return mix(states) & np.uint64(self.parameters.ones_code)
 
     def clock(self, states: Words) -> Words:
@@ -220,7 +220,7 @@ def mix(words: Words) -> Words:
 
 
 def map_tables(images: Words) -> Words:
-    """Return the tables of the linear map from state bit j to `images[j]`: uint64[bits / 8, 256]."""
+    """Return the look-up tables of the linear map that sends state bit j to `images[j]`: uint64[bits / 8, 256]."""
     tables = np.zeros((len(images) // 8, 256), dtype=np.uint64)
     for j, image in enumerate(images):
         table, half = tables[j // 8], 1 << (j % 8)
@@ -229,7 +229,7 @@ def map_tables(images: Words) -> Words:
 
 
 def apply_map(tables: Words, states: Words) -> Words:
-    """Apply a linear map to states, and return the results."""
+    """Return the images of states under the linear map with these look-up tables."""
     images = np.zeros_like(states)
     for byte, table in enumerate(tables):
         images ^= table[(states >> np.uint64(8 * byte)) & np.uint64(255)]
@@ -238,7 +238,7 @@ def apply_map(tables: Words, states: Words) -> Words:
 
 @cache
 def jump_tables(kind: RngKind, stride: int) -> Words:
-    """Return the maps of stride * 2**i steps, one for every bit i of the state: uint64[bits, bits / 8, 256]."""
+    """Return, for each i < bits, the tables of the map that makes stride * 2**i steps: uint64[bits, bits / 8, 256]."""
     lfsr = LFSR(kind)
     basis = np.uint64(1) << np.arange(lfsr.bits, dtype=np.uint64)
     images = basis

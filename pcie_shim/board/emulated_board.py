@@ -42,7 +42,7 @@ _ALIGNMENT: Final = 4096  # chunks end between the blocks of a fast kernel
 
 
 class RefusedError(PcieShimError):
-    """Raised when the board refuses an access; `code` is the error code for the host."""
+    """Raised if a board refuses an access. `code` is the error code that the host receives."""
 
     def __init__(self, code: ErrorCode, detail: str) -> None:
         super().__init__(detail)
@@ -50,12 +50,13 @@ class RefusedError(PcieShimError):
 
 
 class EmulatedBoard:
-    """A board: blank until an image is loaded, then a machine with registers (docs/reference/registers.md)."""
+    """The registers and the machine of a board (docs/reference/registers.md). It is blank until an image is loaded."""
 
     def __init__(self, make: Callable[[Any], Any] | None = None, *, sends_results: bool = True) -> None:
-        """Create a blank board; `make`, if given, makes the kernel of a machine instead of `MachineKind.kernel`.
+        """Create a blank board. `make` creates the kernel of a machine; the default is `MachineKind.kernel`.
 
-        Without `sends_results`, its interrupts do not contain the results, and the host must read them, as on hardware.
+        If `sends_results` is False, interrupts do not contain the results. As on hardware, the host must then read the
+        results.
         """
         self._make = make
         self._sends_results = sends_results
@@ -101,7 +102,7 @@ class EmulatedBoard:
 
     @property
     def image_hash(self) -> str:
-        """SHA-256 (hex) of the loaded image; zeros while blank."""
+        """SHA-256 of the loaded image in hexadecimal, or zeros while the board is blank."""
         return bytes(self._view[rm.IMAGE_HASH : rm.IMAGE_HASH + 32]).hex()
 
     @property
@@ -201,7 +202,7 @@ class EmulatedBoard:
     # ---- registers ------------------------------------------------------------------------------------
 
     def read(self, address: int, count: int) -> bytes:
-        """Return `count` words from `address` on; a RefusedError if a word is not in the map, or not implemented."""
+        """Return `count` words from `address` on, or raise a RefusedError if the board lacks one of the words."""
         end = address + 4 * count
         outside = end > rm.BAR_SIZE or self._access.find(_NO_ACCESS, address >> 2, end >> 2) >= 0
         if address & 3 or not count or outside:
@@ -215,7 +216,7 @@ class EmulatedBoard:
         return words
 
     def write(self, address: int, words: bytes | memoryview) -> None:
-        """Write words from `address` on, as `Board.write`; if a word is refused, earlier ones may have been written."""
+        """Write words from `address` on (see `Board.write`). Words before a refused word may have been written."""
         count = len(words) >> 2
         end = address + 4 * count
         first = address >> 2
@@ -273,7 +274,7 @@ class EmulatedBoard:
     # ---- the machine ----------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Stop, clear counters and cycles, and restart the RNGs from bank 0; DONE and all settings remain."""
+        """Stop the machine, clear counters and cycles, and restart the RNGs from bank 0. Keep DONE and all settings."""
         self.running = False
         self._error = ErrorCode.NONE
         self._compute_ns = 0
@@ -284,7 +285,7 @@ class EmulatedBoard:
         self._publish(BoardState.IDLE, 0, 0)
 
     def release(self) -> None:
-        """Stop a running machine and disable interrupts, because the host has disconnected."""
+        """Stop a running machine and disable interrupts. The server calls this after the host has disconnected."""
         if self.running:
             self.reset()
         self._put(rm.CONTROL, 0)
@@ -332,7 +333,7 @@ class EmulatedBoard:
         self._put(doorbell, number)
 
     def step(self) -> None:
-        """Run the machine for one more chunk; then `running` tells whether it must continue."""
+        """Run the machine for one more chunk of about 50 ms. Then `running` tells whether to call `step` again."""
         machine = self._machine
         if machine is not None and self.running:
             self._run(machine, machine.step, self._chunk_end(machine.cycles, self._max_cycles))
@@ -375,7 +376,7 @@ class EmulatedBoard:
         DONE_BLOCK.pack_into(self._memory, rm.DONE, self.done, status, cycles, self._compute_ns)
 
     def interrupt_words(self) -> bytes:
-        """Return the payload of an interrupt, as `Board.interrupt_words`."""
+        """Return the payload of an interrupt (see `Board.interrupt_words`)."""
         return b"".join(self._answer)
 
     # ---- memory ---------------------------------------------------------------------------------------
