@@ -1,4 +1,4 @@
-"""Sweeps over the possible machines of a model: a stored point for each, their Pareto front, table and picture."""
+"""Sweeps over the possible machines of a model: measured points, their Pareto front, a table and a picture."""
 
 import fcntl
 import hashlib
@@ -93,7 +93,7 @@ class Point(BaseModel):
 
 
 class Results:
-    """The results file with one JSON object per line, from which an interrupted sweep can be resumed."""
+    """The results file of a sweep: one JSON object per line. An interrupted sweep continues from this file."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -120,7 +120,7 @@ class Results:
             pass
 
     def append(self, point: Point) -> None:
-        """Append a point with one write, and wait until it is on the disk."""
+        """Append a point in a single write, and wait until the point is on the disk."""
         line = point.model_dump_json().encode() + b"\n"
         with file_errors(self.path, "written", BuildError), self._locked() as file:
             file.seek(self._torn_at)
@@ -144,7 +144,7 @@ class Results:
                     return
 
     def sort(self, keys: Sequence[str]) -> None:
-        """Move the points of these keys to the end of the file, in this order, as if one process had written them."""
+        """Move the points with these keys to the end of the file, in the order of `keys`."""
         with self._locked():
             points = Results(self.path).points  # with those of other sweeps
             last = dict.fromkeys(keys)
@@ -160,7 +160,7 @@ _MOST_LOST: Final = 0.5
 
 
 def pareto(points: Sequence[Point]) -> list[Point]:
-    """Return the Pareto front of total variation, cycles and ALMs, without machines that lose most frames."""
+    """Return the Pareto front of total variation, cycles and ALMs. Leave out machines that lose most frames."""
     judged = [
         (each, (each.total_variation, each.cycles_median, math.inf if each.alms is None else each.alms))
         for each in points
@@ -176,7 +176,7 @@ def pareto(points: Sequence[Point]) -> list[Point]:
 
 
 def table(points: Sequence[Point], front: Sequence[Point]) -> str:
-    """Return the sweep as text; points on the Pareto front have a star."""
+    """Return the points of a sweep as a text table. A star marks each point of `front`."""
     keys = {point.key for point in front}
     rows = [
         (
@@ -220,7 +220,7 @@ _KINDS_INSIDE: Final = 5
 
 
 def check_plot(path: Path) -> None:
-    """Raise a BuildError, before a long run, if the picture cannot be drawn or written."""
+    """Check before a long run that a picture can be written to `path`. Raise a BuildError if not."""
     if path.suffix not in _SUFFIXES:
         raise BuildError(
             f"{path} is not the name of a picture; expected a name that ends in {', '.join(_SUFFIXES)}"
@@ -233,7 +233,7 @@ def check_plot(path: Path) -> None:
 
 
 def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[Point]) -> None:
-    """Draw accuracy against cycles, with ALMs as the size of points, and the Pareto front."""
+    """Plot total variation against cycles. A larger dot has more ALMs, and a circle marks a point of `front`."""
     largest = max((point.alms or 0.0 for point in points), default=0.0) or 1.0
     kinds = sorted({(point.scale, point.rng) for point in points})
     beside = len(kinds) > _KINDS_INSIDE
@@ -310,7 +310,7 @@ def _name_points(axes: Any, names: Iterable[tuple[tuple[float, float], str]]) ->
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A machine to measure, and the key of its results."""
+    """A machine to measure, and the key of its point in the results file."""
 
     plan: MachinePlan
     key: str
@@ -325,7 +325,7 @@ def _fingerprint(model: Model, readings: Readings) -> str:
 
 
 def tasks(model: Model, sweep: Sweep, readings: Readings, device: Device) -> list[Task]:
-    """Return the machines of a sweep that can be built, or raise a BuildError if there are none."""
+    """Return a task for each machine of a sweep that can be built. Raise a BuildError if there is no such machine."""
     found: dict[str, Task] = {}
     refused, inputs = "", _fingerprint(model, readings)
     for options in sweep.options():
@@ -355,7 +355,7 @@ def tasks(model: Model, sweep: Sweep, readings: Readings, device: Device) -> lis
 
 
 def run_task(task: Task, readings: Readings, device: Device, banks: int) -> Point:
-    """Measure one machine, or raise a ToolchainError if it cannot be built or run."""
+    """Measure one machine, or raise a ToolchainError if the machine cannot be built or run."""
     model, options, parameters = task.plan.model, task.plan.options, task.plan.parameters
     quantised = quantise(model, prob_bits=task.plan.parameters.prob_bits, scale=options.scaling)
     machines = split(whole_machine(task.plan, quantised), options.partitions)
@@ -396,7 +396,7 @@ def run_task(task: Task, readings: Readings, device: Device, banks: int) -> Poin
 
 
 def with_resources(task: Task, point: Point, device: Device) -> Point:
-    """Return a point with the resources of the machine's largest board, as estimated now."""
+    """Return a point with a new estimate of the resources of the machine's largest board."""
     parameters, options = task.plan.parameters, task.plan.options
     if options.rng is RngKind.IDEAL:
         return point
@@ -408,7 +408,7 @@ def with_resources(task: Task, point: Point, device: Device) -> Point:
 
 @dataclass(frozen=True, slots=True)
 class SweepJob:
-    """The job of a sweep: piece n measures the machine of task n."""
+    """A sweep as a job in pieces. Piece n measures the machine of task n."""
 
     tasks: Sequence[Task]
     readings: Readings
@@ -421,9 +421,10 @@ class SweepJob:
 
 
 def run_sweep(job: SweepJob, run: Run, results: Results, advance: Callable[[Point], None]) -> None:
-    """Measure the machines without a stored result, and store every point as soon as it is measured.
+    """Measure each machine that has no stored result, and store its point as soon as it is measured.
 
-    At the end, the sweep's points are in the file in the order of its tasks, whichever process measured them.
+    `advance` receives every point, including points that were stored before. At the end, the points stand in the file
+    in the order of the tasks, whichever process measured them.
     """
     left = [number for number, task in enumerate(job.tasks) if task.key not in results.points]
     for key in (task.key for task in job.tasks if task.key in results.points):

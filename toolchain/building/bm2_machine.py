@@ -1,4 +1,4 @@
-"""The BM2 for a network: its plan, limits on its tables and results, and each board's chain (thesis 2.1.3)."""
+"""The design of a BM2 for a network: its plan, its size limits, and one machine per board (thesis 2.1.3)."""
 
 from dataclasses import dataclass, replace
 from typing import ClassVar, Final
@@ -34,11 +34,11 @@ BM2_KEYS: Final = tuple(key for key in BM2Section.model_fields if key in BM2Para
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class BM2Plan:
-    """The BM2 for a model, before any table is computed."""
+    """The plan of a BM2 for a model. The plan contains no tables."""
 
     kind: ClassVar = "BM2"
     why: str
-    """The reason for a BM2, as a clause."""
+    """The reason why the machine is a BM2, as a clause."""
     model: NetworkModel
     options: BuildOptions
     parameters: BM2Parameters
@@ -46,11 +46,11 @@ class BM2Plan:
     target_count: int
     """The number of samples of each board."""
     max_cycles: int
-    """The maximum number of cycles: a safety stop, which also limits how long the host waits for a board."""
+    """The maximum number of cycles of a frame, as a safety stop. It also limits how long the host waits for a board."""
 
 
 def plan_bm2(model: NetworkModel, options: BuildOptions, why: str = "it was asked for") -> BM2Plan:
-    """Derive the parameters of the machine for a network, or raise a BuildError if it is too large for one."""
+    """Return the plan of a BM2, or raise a BuildError if the network is too large or an option is not possible."""
     _check_sizes(model)
     place = {name: at for at, name in enumerate(model.names)}
     if not 1 <= options.partitions <= CHAINS_MAX:
@@ -116,7 +116,7 @@ def _check_sizes(model: NetworkModel) -> None:
 
 
 def chain_machines(plan: BM2Plan) -> tuple[BM2Machine, ...]:
-    """Return each board's machine: equal tables, but different seeds. Raise a BuildError if no state is possible."""
+    """Return each board's machine, with equal tables but its own seeds. Raise a BuildError if no state is possible."""
     parameters, table = plan.parameters, plan.options.rng_table
     if table is None and parameters.rng is RngKind.TABLE:
         table = random_table(parameters.prob_bits)
@@ -133,10 +133,10 @@ def chain_machines(plan: BM2Plan) -> tuple[BM2Machine, ...]:
 
 
 def clipped(factor: NDArray[np.float64], prob_bits: int) -> tuple[int, int, int]:
-    """Return how many odds of a factor are clipped, how many of these because of zeros, and the number of all odds.
+    """Return the numbers of clipped odds, of odds clipped because of a zero, and of all odds in a factor.
 
-    Odds compare two values of one variable whose codes differ in one bit, with all other variables unchanged. They are
-    clipped if they are beyond what a code can express.
+    Odds compare two values of one variable, with all other variables unchanged. The binary codes of the two values
+    differ in one bit. Odds are clipped if they are too extreme for a probability code.
     """
     clips = zeros = count = 0
     for axis, size in enumerate(factor.shape):

@@ -20,7 +20,7 @@ SHARED_BITS: Final = {
     "BM1": "means are correct, but the variance of counts is up to 2.6 times as large",
     "BM2": "this biases all samples",
 }
-"""For each kind of machine, a clause on the effect of successive random numbers that share bits."""
+"""Clauses by kind of machine: what happens if successive random numbers share bits."""
 
 
 def build_report(model: Model, deployment: Deployment, quantised: Quantised, interface_reason: str) -> str:
@@ -56,7 +56,7 @@ def build_report(model: Model, deployment: Deployment, quantised: Quantised, int
 def bm2_report(
     model: NetworkModel, deployment: Deployment, machine: BM2Machine, why: str, interface_reason: str
 ) -> str:
-    """Return the report of a BM2; `why` is the reason for this kind of machine, as a clause."""
+    """Return the report of a BM2. `why` is a clause with the reason why the machine is a BM2."""
     searched = ", ".join(f"{each.label} ({each.size})" for each in model.searched)
     known = ", ".join(model.known) or "nothing"
     parameters, limits = machine.parameters, deployment.machine
@@ -124,7 +124,7 @@ def _boards(deployment: Deployment, what: str, places: Sequence[str]) -> str:
 
 
 def loss_heading(sensor_mode: SensorMode) -> str:
-    """Return the heading of the table of quantisation losses."""
+    """Return the heading above the table of quantisation losses."""
     posterior = "the column's own posterior"
     if sensor_mode is SensorMode.CELL:
         posterior += " where all lines read the same"
@@ -132,7 +132,7 @@ def loss_heading(sensor_mode: SensorMode) -> str:
 
 
 def many_sentence(machine: MachineSection) -> str:
-    """Describe a frame's readings and results; empty in the usual case of one number per variable and one posterior."""
+    """Describe multiple readings per variable or multiple posteriors per frame. Return "" if there are neither."""
     sentence = {
         SensorMode.COLUMN: "",
         SensorMode.CELL: f" Each of the {machine.lines} lines has a reading of its own (sensor_mode = cell).",
@@ -150,7 +150,7 @@ def many_sentence(machine: MachineSection) -> str:
 
 
 def edited_sentence(deployment: Deployment) -> str:
-    """Say which boards' images were edited, and what this means for a comparison with the model."""
+    """Return sentences that name the boards with edited images and warn about comparisons with the model."""
     boards = ", ".join(map(str, deployment.edited_boards))
     return (
         f"Edited since the build: the image of board {boards}. Its codes may not be the model's, so a difference from the "

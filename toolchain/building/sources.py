@@ -1,4 +1,4 @@
-"""The topics of a build, and the path of each variable in a message: from a sources file, `--order` and `--path`."""
+"""Topics of readings and paths of variables in messages, from a sources file, `--order` and `--path`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,30 +16,30 @@ MOST_SOURCES: Final = 256
 
 
 class SourceTable(Source):
-    """A `[[source]]` of a sources file: a topic with its variables. If it has no `uri`, `--uri` applies."""
+    """A `[[source]]` of a sources file: a topic and its variables. If the source has no `uri`, `--uri` applies."""
 
     variables: dict[Name, MessagePath] | None = None
-    """The path of each variable in the message, by name; None for all variables that no other source has."""
+    """Maps a variable's name to its path in the message. None selects all variables that no other source has."""
     prior: MessagePath | None = None
-    """The path, in the message, of the prior that the host writes; None if the message contains no prior."""
+    """The path of the prior in the message, or None if the message contains no prior."""
 
 
 class SourcesTables(Section):
-    """The tables of a sources file, for validation."""
+    """The schema that validates the tables of a sources file."""
 
     sources: Sequence[SourceTable] = Field(validation_alias="source", min_length=1, max_length=MOST_SOURCES)
 
 
 @dataclass(frozen=True, slots=True)
 class SourcesFile:
-    """A sources file: its valid tables, and its TOML text, in which mistakes are located."""
+    """A sources file: its validated tables, and its TOML text. An error points to a line of the text."""
 
     toml: TomlFile
     tables: tuple[SourceTable, ...]
 
     @property
     def sources(self) -> tuple[Source, ...]:
-        """The topics without their variables, as a deployment lists them."""
+        """The sources without their variables, in the form in which a deployment lists them."""
         return tuple(
             Source(**{key: getattr(table, key) for key in Source.model_fields}) for table in self.tables
         )
@@ -51,7 +51,7 @@ class SourcesFile:
         return WrittenPrior(source=paths[0][0], path=paths[0][1]) if paths else None
 
     def place(self, variables: tuple[Variable, ...]) -> tuple[Variable, ...]:
-        """Return a model's variables with the file's sources and paths, or raise a BuildError if these don't match."""
+        """Return `variables` with sources and paths from this file. Raise a BuildError if the names do not match."""
         places: dict[str, tuple[int, str]] = {}
         names = [variable.name for variable in variables]
         for at, table in enumerate(self.tables):
@@ -76,7 +76,7 @@ class SourcesFile:
         return tuple(variable.replace(source=source, path=path) for variable, source, path in found)
 
     def check(self) -> None:
-        """Raise a BuildError for mistakes that can be found without a model."""
+        """Raise a BuildError if the file has a mistake that can be found without a model."""
         seen: dict[tuple[str, str], int] = {}
         priors = [at for at, table in enumerate(self.tables) if table.prior is not None]
         rests = [at for at, table in enumerate(self.tables) if table.variables is None]
@@ -98,7 +98,7 @@ class SourcesFile:
 
 
 def read_sources(path: Path, uri: str | None) -> SourcesFile:
-    """Read a sources file, or raise a BuildError with the line; `uri` is the server of sources that name none."""
+    """Read a sources file, or raise a BuildError with the line. `uri` is the server of each source without a server."""
     toml = TomlFile.read(path, BuildError)
     tables = toml.tables.get("source")
     for at, table in enumerate(tables if isinstance(tables, list) else ()):

@@ -47,7 +47,7 @@ def check_model(
 ) -> list[Finding]:
     """Return the findings about a model and its machine, the worst first.
 
-    `fit` changes the plan of a BM1 to as many boards as its machine needs.
+    `fit` takes the plan of a BM1 and returns a plan with as many boards as the machine needs.
     """
     refused: list[Finding] = []
     try:  # apart from the plan, so that mistakes in both are found at once
@@ -73,7 +73,7 @@ def check_model(
 
 
 def check_deployment(directory: Path) -> list[Finding]:
-    """Return the findings about a deployment's files and the machine in its images, the worst first."""
+    """Return the findings about a deployment's files and about the machine in its images, the worst finding first."""
     try:
         deployment = load_deployment(directory)
         images = read_images(deployment)
@@ -90,7 +90,7 @@ def check_deployment(directory: Path) -> list[Finding]:
 
 
 def refusal(reason: Exception, about: str) -> Finding:
-    """Return an exception as the finding that `about`, a part of a model or a deployment, cannot be built or read."""
+    """Return the finding that a part of a model or a deployment, `about`, cannot be built or read for this reason."""
     return error(Check.CANNOT_BE_BUILT, about, str(reason).rstrip("."))
 
 
@@ -177,7 +177,7 @@ def _ranges(deployment: Deployment) -> Iterator[Finding]:
 
 
 def state_findings(variable: Variable) -> Iterator[Finding]:
-    """Warn if a reading that is sent as a number or a bool selects another state than its sender probably means."""
+    """Warn if a number or a bool, sent as a reading, probably selects another state than the sender means."""
     states, shown = variable.states, ", ".join(variable.states[:_MOST_NAMES])
     for at, name in enumerate(states):
         number = variable.offset + at * variable.step
@@ -213,7 +213,7 @@ _LEAST_TOLERANCE_S: Final = 0.005
 
 
 def source_findings(deployment: Deployment) -> Iterator[Finding]:
-    """Find topics whose messages are paired with other topics' by time of receipt, because they have no header."""
+    """Find topics whose messages have no header. The messages are paired with other topics by time of receipt."""
     if len(deployment.sources) < 2:
         return
     bare = [source.topic for source in deployment.sources if not _may_have_header(source.type)]

@@ -1,4 +1,4 @@
-"""Tables learnt from recorded readings with ground truth: the method, and its assumptions."""
+"""Learning tables from recordings with ground truth: the methods, and the flags of a fit."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -13,9 +13,9 @@ class FitMethod(StrEnum):
     """A method of learning."""
 
     NORMALS = "normals"
-    """Bias, standard deviation and share of outliers, for variables that are normal around the model's mean."""
+    """Learn bias, standard deviation and share of outliers. Readings must be normal around the mean in the model."""
     COUNTS = "counts"
-    """Whole tables, by counting how often each value was read at each true position."""
+    """Learn whole tables: count how often each value was read while each cell was the true cell."""
 
 
 class FitPrior(StrEnum):
@@ -29,7 +29,7 @@ class FitPrior(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions:
-    """The flags of a fit, except the model and the recordings."""
+    """The flags of `toolchain fit`. Its arguments, the model and the recordings, are not included."""
 
     truth: Annotated[
         list[str],

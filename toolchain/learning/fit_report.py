@@ -1,4 +1,4 @@
-"""The steps of a fit, from reading the recordings to writing its file, and its report on the data of each table."""
+"""The run of a fit: it reads recordings, learns the tables, writes the file of the fit, and reports on each table."""
 
 import hashlib
 import math
