@@ -1,4 +1,4 @@
-"""The base of all command lines: start-up, checks of all flags, and exit."""
+"""The base class of all command lines: start-up, checks of all flags, and exit."""
 
 import math
 import sys
@@ -21,10 +21,10 @@ _COMPLETION: Final = frozenset({"install_completion", "show_completion"})
 
 
 class CommandLine(typer.Typer):
-    """A command, or a group of commands, whose failures are one sentence on standard error and an exit code."""
+    """A command or a group of commands. It reports a failure as one sentence on standard error and an exit code."""
 
     def __init__(self, **settings: Any) -> None:
-        """Create a `typer.Typer` with these settings and those that all commands share."""
+        """Create a `typer.Typer` with `settings`, and with the settings that all commands share."""
         super().__init__(
             cls=_Group,
             pretty_exceptions_enable=False,
@@ -36,7 +36,7 @@ class CommandLine(typer.Typer):
     def command(
         self, name: str | None = None, *, cls: type[TyperCommand] | None = None, **settings: Any
     ) -> Callable[[Any], Any]:
-        """Register a function as a command; its integer result is the exit code."""
+        """Register a function as a command. If the function returns an integer, the integer is the exit code."""
         return super().command(name, cls=cls or _Command, **settings)
 
     def add_later(self, name: str, module: str, *, purpose: str) -> None:

@@ -1,4 +1,4 @@
-"""Exit of a command: conversion of every error to one sentence and an exit code."""
+"""The end of a command: it reports an error on standard error and turns the error into an exit code."""
 
 import errno
 import os
@@ -22,8 +22,8 @@ _TOO_MANY_FILES: Final = frozenset({errno.EMFILE, errno.ENFILE})
 def outcome(command: Callable[[], object]) -> int:
     """Run a command, report its failure on standard error, and return its exit code.
 
-    Only a bug, that is, an exception not raised by the project, shows a traceback. Signals are ignored
-    afterwards.
+    An unexpected exception is a bug, and its report contains a traceback. After the command, the process ignores
+    signals.
     """
     try:
         try:
@@ -40,7 +40,7 @@ def outcome(command: Callable[[], object]) -> int:
 
 
 def report(error: BaseException) -> int:
-    """Report the error that ended a command on standard error, and return its exit code."""
+    """Report, on standard error, the exception that ended a command. Return the exit code of the command."""
     if isinstance(error, SystemExit):
         return error.code if isinstance(error.code, int) else ExitCode.DONE
     if isinstance(error, typer.TyperException):

@@ -1,7 +1,6 @@
 """Checks of outbound messages against the definition of their type: names of fields, and shapes of arrays.
 
-They find mistakes of a program that its first message already shows: a misspelt field, nested arrays. The values
-of scalars are not checked.
+The checks find programming errors such as a misspelt field or a nested array. The values of scalars are not checked.
 """
 
 import difflib
@@ -12,7 +11,7 @@ from bridge.errors import MessageTypeError, NameFormError
 from bridge.names import ros1_type, ros2_type
 
 SCALAR: Final = -1
-"""The `length` of a `FieldType` that is not an array; an array of any length has 0."""
+"""The `length` of a `FieldType` if the field is no array. An array of any length has the `length` 0."""
 _MAX_TYPES: Final = 1000
 _MAX_FIELDS: Final = 1000
 _MAX_LENGTH: Final = (1 << 32) - 1
@@ -26,7 +25,7 @@ _TIMES: Final = frozenset({"time", "duration", "builtin_interfaces/Time", "built
 
 
 class FieldType(NamedTuple):
-    """Type of a field: its element type in the form of ROS 1, and its length (`SCALAR`, 0 for any length, or fixed)."""
+    """A field's element type, named as in ROS 1, and its length: `SCALAR`, 0 for any length, or a fixed length."""
 
     element: str
     length: int
@@ -40,11 +39,11 @@ _TIME_FIELDS: Final = {name: FieldType("int32", SCALAR) for name in ("secs", "ns
 """The fields of a time in both ROS versions; servers accept either spelling."""
 
 Definitions = dict[str, dict[str, FieldType]]
-"""The fields of types, by the types' names in the form of ROS 1."""
+"""Maps the name of a message type, in the form of ROS 1, to the names and types of its fields."""
 
 
 def definitions_from_rosapi(answer: Any) -> Definitions:
-    """Read the answer of rosapi's `message_details`; types that cannot be read are left out."""
+    """Return the definitions in an answer of rosapi's service `message_details`. Unreadable types are left out."""
     typedefs = answer.get("typedefs") if isinstance(answer, dict) else None
     found: Definitions = {}
     for each in typedefs[:_MAX_TYPES] if isinstance(typedefs, list) else []:
@@ -90,9 +89,9 @@ def bundled_definitions(type_name: str, ros_version: int) -> Definitions:
 
 
 def element_of(kind: Any, content: Any) -> tuple[str, int]:
-    """Return a field's element type and length, from its description by rosbags.
+    """Convert rosbags' description of a field to the element type and the length of the field.
 
-    The length is `SCALAR` for a field that is no array, and 0 for an array of any length.
+    The length is `SCALAR` if the field is no array, and 0 if the field is an array of any length.
     """
     match kind.name:
         case "BASE":

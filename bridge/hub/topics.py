@@ -40,7 +40,7 @@ _MESSAGE_WORK: Final = 20
 _COPIED: Final = 4096
 _JSON_COPIES: Final = 8
 TURN_WORK: Final = 10_000
-"""Units of work, of about a microsecond each, after which a client's turn ends."""
+"""A client's turn ends after this many units of work. A unit takes about a microsecond."""
 _PLAIN: Final = Encoding.NONE
 
 
@@ -55,7 +55,7 @@ class Topics:
         definitions: MessageDefinitions,
         refuse: Callable[[Client, str, OperationId], None],
     ) -> None:
-        """Start without topics; `refuse` reports a message that cannot be encoded for a subscriber."""
+        """Start without topics. `refuse` is called if a message cannot be encoded for a subscriber."""
         self._graph = graph
         self._limits = limits
         self._dispatcher = dispatcher
@@ -93,7 +93,7 @@ class Topics:
             client.open_advertisements -= 1
 
     def publish(self, client: Client, operation: Operation, raw: bytes | None, now: float) -> None:
-        """Perform `publish`; `raw` is the operation as received, if it was strict JSON."""
+        """Perform a `publish` operation. `raw` is the operation as received, or None if it was not strict JSON."""
         name, parsed = text(operation, "topic"), operation.get("msg", {})
         if type(parsed) is not dict:
             raise RefusedOperationError(f"the message for {name} is not a JSON object")
@@ -190,7 +190,7 @@ class Topics:
         return payloads, messages_parsed
 
     def distribute(self, topic: Topic, parsed: dict[str, Any], now: float) -> None:
-        """Deliver a message to all subscribers of its topic."""
+        """Deliver a message to all subscribers of a topic. Raise a RefusedOperationError if it is too large."""
         payload = orjson.dumps(parsed) + b"}"
         # Rewriting can lengthen a message (1e15 becomes 1000000000000000.0).
         if len(payload) - 1 > topic.largest:

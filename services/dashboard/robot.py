@@ -1,6 +1,6 @@
-"""The robot and the stack as the page sees them: topics, services, and the status sockets of this machine.
+"""The dashboard's connections to the robot (topics and services) and to the stack (status sockets).
 
-Lost connections are retried for ever, because the page may start before the robot and outlive it.
+Lost connections are retried for ever, because the dashboard may start before the robot and outlive it.
 """
 
 import asyncio
@@ -106,7 +106,7 @@ class WatchedRobot:
     # Following
 
     async def follow(self) -> None:
-        """Follow the topics until cancelled; retry every second if the server is not reachable.
+        """Follow the topics until cancelled. If the server is not reachable, retry every second.
 
         Raises:
             UsageError: The URI or a topic cannot be used.
@@ -212,7 +212,7 @@ class WatchedRobot:
     # The stack
 
     async def watch_stack(self, directory: Path) -> None:
-        """Read the status sockets of this computer until cancelled."""
+        """Read the status of all processes of the stack on this computer every second, until cancelled."""
         while True:
             status = await ask_stack(directory, shared=self._settings.run_directory is None)
             self.why = status.why
@@ -254,7 +254,7 @@ class WatchedRobot:
         return self._axes if ours == list(zip(frame.labels, frame.values.shape, strict=True)) else ()
 
     def words_for(self, frame: KeptFrame) -> dict[str, tuple[str, tuple[str, ...]]]:
-        """Return the unit and the states of each variable of a frame, as far as they are known."""
+        """Return the unit and the states of each variable by name, or {} if the deployment of the frame is unknown."""
         deployment = self._deployment_of(frame)
         known = deployment.variables if deployment is not None else ()
         return {each.name: (each.unit, each.states) for each in known}
@@ -278,7 +278,7 @@ class WatchedRobot:
     # Asking
 
     def set_pose(self, x: float, y: float) -> None:
-        """Move the simulated boat to (x, y); do nothing without a connection or a subscriber."""
+        """Move the simulated boat to (x, y). Without a connection or a subscriber, do nothing."""
         ros, poses = self._ros, self._poses
         if ros is None or poses is None or not self.can_set_pose or not math.isfinite(x + y):
             return
@@ -290,7 +290,7 @@ class WatchedRobot:
             poses.publish_nowait({"header": head, "pose": pose_at(x, y)})
 
     async def switch(self, name: str, on: bool) -> str:
-        """Set a switch of the simulated world to `on`; return the reason of a failure, empty on success."""
+        """Set a switch of the simulated world to `on`. Return why this failed, or an empty string on success."""
         if self._ros is None or name not in self.switches:
             return "this switch is not there now"
         try:
@@ -318,7 +318,7 @@ def _point(pose: Any) -> tuple[float, float] | None:
 
 
 def read_landmarks(message: Mapping[str, Any]) -> list[tuple[float, float, str]]:
-    """Return x, y and name of each marker with a usable position."""
+    """Return x, y and the name of each marker with finite coordinates."""
     markers = message.get("markers")
     found = [
         (*point, str(marker.get("text") or marker.get("id") or "")[:_MAX_NAME])

@@ -1,1 +1,1 @@
-"""A run of the master: its peers, and the flow of frames between them."""
+"""One run of the master: its connections to the services, and the flow of frames between them."""

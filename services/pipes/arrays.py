@@ -1,4 +1,4 @@
-"""`publisher` without a deployment: numbers of standard input as messages with an array (thesis 3.1, Publisher.jar)."""
+"""The command `publisher` without a deployment: each line of numbers becomes a message (thesis 3.1, Publisher.jar)."""
 
 import asyncio
 import base64
@@ -55,7 +55,7 @@ _RANGES: Final[dict[str, tuple[float, float]]] = {
 
 @dataclass(frozen=True, slots=True)
 class ArrayField:
-    """A field that is an array of numbers, in messages of one type."""
+    """One field of a message type: an array of numbers."""
 
     message_type: str
     place: Place
@@ -67,7 +67,7 @@ class ArrayField:
         return format_place(self.place)
 
     def numbers(self, line: bytes, number: int) -> list[float]:
-        """Return the values in line `number` of standard input, int for integer arrays, or raise an InputLineError."""
+        """Convert a line to values of the array's element type, or raise an InputLineError with the line's `number`."""
         where = f"line {number} of standard input"
         text = line.strip()
         found: list[float]
@@ -104,7 +104,7 @@ class ArrayField:
         return int(value) if is_whole else float(value)
 
     def message(self, numbers: list[float]) -> dict[str, Any]:
-        """Return a message with these numbers; the server fills the other fields."""
+        """Return a message that contains only this array, filled with `numbers`. The server adds the other fields."""
         octets = self.kind.element in {"uint8", "char"}
         value: Any = bytes(map(int, numbers)) if octets else numbers
         for step in reversed(self.place):
@@ -113,7 +113,7 @@ class ArrayField:
         return message
 
     def holds(self, message: dict[str, Any], numbers: list[float]) -> bool:
-        """Return whether a received message has these numbers; float32 arrays may be rounded."""
+        """Return whether the array in a received message equals `numbers`, up to the rounding of a float32."""
         received: Any = message
         for step in self.place:
             received = received.get(step) if isinstance(received, dict) else None
@@ -168,11 +168,11 @@ async def _definitions(ros: Ros, message_type: str) -> Definitions:
 
 
 async def publish_arrays(settings: Settings, source: Source, path: str | None) -> int:
-    """Publish each line of standard input as one message of a topic, and wait until each message comes back.
+    """Publish each line of standard input as a message of a topic. Wait until the server sends every message back.
 
     Raises:
-        InputLineError: A line cannot be a message of the type, or there is no line.
-        SettingsError: The type does not have this field.
+        InputLineError: A line does not fit the array, a message is too large, or standard input is empty.
+        SettingsError: The fields of the type are unknown, or `path` does not select exactly one array of numbers.
         BridgeError: The topic has another type, the server is unreachable, or a message did not come back.
     """
     async with contextlib.AsyncExitStack() as stack:

@@ -1,1 +1,1 @@
-"""Local sockets between the master and its services, and the records that these exchange."""
+"""Local sockets between the master and its services, and the records that are sent over them."""
