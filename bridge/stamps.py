@@ -10,7 +10,10 @@ _KEYS: Final = (("sec", "nanosec", 2), ("secs", "nsecs", 1))
 
 
 def stamp(time_ns: int, ros_version: Literal[1, 2] | None = None) -> dict[str, int]:
-    """Return nanoseconds since 1970 as a `stamp` with the keys of one ROS version, or of both if it is None."""
+    """Return a time in nanoseconds since 1970 as a ROS time with the keys of one ROS version.
+
+    If `ros_version` is None, the time has the keys of both versions.
+    """
     seconds, nanoseconds = divmod(time_ns, _NS)
     time: dict[str, int] = {}
     for second, nanosecond, version in _KEYS:
@@ -21,7 +24,7 @@ def stamp(time_ns: int, ros_version: Literal[1, 2] | None = None) -> dict[str, i
 
 
 def header(time_ns: int, frame_id: str = "", ros_version: Literal[1, 2] | None = None) -> dict[str, Any]:
-    """Return a `std_msgs/Header` without `seq`, which ROS 1 fills in and ROS 2 refuses."""
+    """Return a `std_msgs/Header` without `seq`, because ROS 1 fills `seq` in and ROS 2 refuses it."""
     return {"stamp": stamp(time_ns, ros_version), "frame_id": frame_id}
 
 
@@ -49,7 +52,7 @@ def header_stamp_ns(msg: Mapping[str, Any]) -> int | None:
 
 
 def ros_version_of_message(msg: Mapping[str, Any]) -> Literal[1, 2] | None:
-    """Return the ROS version that a message's stamp shows, or None if there is no stamp or the stamp has both forms."""
+    """Return the ROS version that the keys of `header.stamp` show, or None if they are missing or show both versions."""
     head = msg.get("header")
     time = head.get("stamp") if isinstance(head, Mapping) else None
     if not isinstance(time, Mapping) or ("sec" in time) == ("secs" in time):

@@ -1,4 +1,4 @@
-"""The command `demo`: a case study from end to end, whose processes are started in order and ended together."""
+"""The command `demo`, which runs a case study. It starts the processes in order, and ends them together."""
 
 import asyncio
 import contextlib
@@ -26,7 +26,7 @@ from terminal.processes import Process, Screen
 from terminal.signals import run_async
 
 FIRST_TIMEOUT: Final = 180.0
-"""Seconds in which the viewer's first result must come; meanwhile the deployment is built and kernels are compiled."""
+"""Timeout in seconds of the viewer's first result. It includes building the deployment and compiling kernels."""
 PORT: Final = "9090"
 """Port of the hub in a demo that runs until Ctrl-C."""
 FIRST_RESULT: Final = r"^ *[0-9]+ "
@@ -37,7 +37,7 @@ app = CommandLine()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """A case study as the demo runs it. Its commands get the options listed here, and `--uri`."""
+    """A case study as the demo runs it. Each command gets its options from this object, and the option `--uri`."""
 
     name: str
     topic: str
@@ -46,18 +46,18 @@ class Case:
     options: Sequence[str] = ()
     """Options of the build."""
     pointer: str = ""
-    """Advice, if any, that is printed after the address of the dashboard's page."""
+    """Advice that is printed after the address of the dashboard's page, or empty."""
     viewer: str
     viewing: Sequence[str] = ()
     """Options of the viewer."""
     publishers: Mapping[str, Sequence[str]]
-    """The commands on the robot's side with their options, in the order of their start."""
+    """Options of each command on the robot's side, in the order in which the commands are started."""
     counts_frames: bool = True
-    """True if the viewer shows all of the master's frames; then the demo gives `--count` to the master as well."""
+    """Whether the viewer shows every frame of the master. If so, the demo also gives `--count` to the master."""
 
 
 def boat(rates: Sequence[str], clock: float, *, array: bool) -> Case:
-    """Return the boat on four boards; with `array`, its readings are plain arrays."""
+    """Return the boat on four boards. With `array`, the readings are published as std_msgs/Float64MultiArray."""
     flags = ["--array"] if array else []
     return Case(
         name="boat",
@@ -90,7 +90,7 @@ def sprinkler(rates: Sequence[str], count: int) -> Case:
 
 
 def disparity(rates: Sequence[str]) -> Case:
-    """Return binocular disparity on one board, with a machine for each of 160 pixels."""
+    """Return binocular disparity on one board. The board has a replica of the machine for each of 160 pixels."""
     options = {"sensor-mode": "threshold", "replicas": 160, "queue": "all", "max-cycles": 8192}
     return Case(
         name="disparity",
@@ -107,7 +107,7 @@ def disparity(rates: Sequence[str]) -> Case:
 async def build(
     case_study: str, deployment: Path, uri: str, topic: str, type_: str, *options: str, boards: int = 4
 ) -> None:
-    """Build a case study's deployment; the report goes to DEPLOYMENT.log.
+    """Build a case study's deployment, and write the toolchain's output to DEPLOYMENT.log next to it.
 
     Raises:
         ProcessError: The toolchain failed.
@@ -167,7 +167,7 @@ def demo(
         Path, typer.Option(help="Folder for the pictures, the deployment and logs.", metavar="DIR")
     ] = Path("out"),
 ) -> int:
-    """Run a case study from end to end, without a robot: the boat, or the one that a flag selects."""
+    """Run a case study from end to end, with a simulated robot. Without a flag for another case study, run the boat."""
     if dashboard and find_spec("nicegui") is None:
         raise OutputError(
             "--dashboard needs NiceGUI, which is not installed: pip install 'rosbayes[dashboard]', or leave it out"

@@ -1,7 +1,7 @@
-"""Vectors of 512 bits in compiled code: their type and operators for numba, and functions written as LLVM code.
+"""Vectors of 512 bits in code compiled by numba: their type, their operators, and functions written as LLVM code.
 
-numba does not vectorise a loop over only 8 words (it was 2.5 times slower), so hot loops use these vectors. They work
-on any processor, but are not passed to functions.
+Hot loops use these vectors, because numba does not vectorise a loop over only 8 words. Without vectors, the loops were
+2.5 times slower. Vectors work on any processor. They are local variables, and are not passed to compiled functions.
 """
 
 import math
@@ -20,7 +20,7 @@ extending: Any = untyped_extending
 
 
 def aligned(shape: tuple[int, ...], dtype: type[np.generic]) -> npt.NDArray[Any]:
-    """Return zeros at an address that is a multiple of 64 bytes, as vectors need."""
+    """Return an array of zeros whose address is a multiple of 64 bytes, as vectors need."""
     size = math.prod(shape) * np.dtype(dtype).itemsize
     room = np.zeros(size + 64, dtype=np.uint8)
     first = -room.ctypes.data % 64
@@ -97,7 +97,7 @@ def load(builder: Any, data: Any, place: Any) -> Any:
 
 @in_llvm(types.void, None, types.int64, VECTOR)
 def store(builder: Any, data: Any, place: Any, vector: Any) -> None:
-    """Write a vector as vector number `place` of an array."""
+    """Write a vector to an array, as the vector number `place`."""
     builder.store(vector, builder.gep(builder.bitcast(data, _VECTOR.as_pointer()), [place])).align = 64
 
 
@@ -116,13 +116,13 @@ def splat(builder: Any, word: Any) -> Any:
 
 @in_llvm(types.uint64, types.uint64)
 def first_one(builder: Any, word: Any) -> Any:
-    """Return the place of the lowest 1 of a word that is not 0."""
+    """Return the bit number of the lowest 1 in a word. The word must not be 0."""
     return builder.cttz(word, ir.Constant(ir.IntType(1), 1))
 
 
 @in_llvm(VECTOR, VECTOR, VECTOR)
 def below(builder: Any, left: Any, right: Any) -> Any:
-    """Compare two vectors word by word: all ones where the left word is less than the right word, else 0."""
+    """Compare two vectors word by word. A word of the result is all ones if the left word is less, and 0 otherwise."""
     return builder.sext(builder.icmp_unsigned("<", left, right), _VECTOR)
 
 
@@ -134,7 +134,7 @@ def _called(builder: Any, name: str, result: Any, *given: Any) -> Any:
 
 @in_llvm(VECTOR, VECTOR)
 def first_ones(builder: Any, vector: Any) -> Any:
-    """Return the place of the lowest 1 of each word, none of which is 0."""
+    """Return the bit number of the lowest 1 in each word. No word may be 0."""
     return _called(builder, "llvm.cttz.v8i64", _VECTOR, vector, ir.Constant(ir.IntType(1), 1))
 
 

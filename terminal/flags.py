@@ -20,30 +20,33 @@ from pydantic import BaseModel
 
 @dataclass(frozen=True, slots=True)
 class Flag:
-    """A flag's names other than `--field-name`, the word for its value, and the text of its default."""
+    """Names of a flag, the word for its value, and the text of its default.
+
+    If `names` is empty, the name is `--` and the name of the field.
+    """
 
     names: tuple[str, ...] = ()
     metavar: str | None = None
     otherwise: str = ""
-    """Text that the help shows as the default; empty to show the field's default."""
+    """Text that the help shows as the default. If it is empty, the help shows the field's default."""
 
 
 @dataclass(frozen=True, slots=True)
 class Group:
-    """The flags that replace one parameter of a command, and the function that composes it from their values."""
+    """Flags that replace one parameter of a command. `compose` makes the parameter's value from the flags' values."""
 
     flags: Sequence[inspect.Parameter]
     compose: Callable[..., Any]
 
 
 def field_flag(model: type[BaseModel], name: str) -> Flag:
-    """Return the `Flag` in the annotation of a model's field, or an empty one."""
+    """Return the `Flag` in the annotation of a model's field, or `Flag()` if there is none."""
     found = [each for each in model.model_fields[name].metadata if isinstance(each, Flag)]
     return found[0] if found else Flag()
 
 
 def default_of(model: type[BaseModel], name: str) -> str:
-    """Return the default of a model's field as text; empty if there is none."""
+    """Return the default of a model's field as text for the help, or "" if the field has no default."""
     default = model.model_fields[name].default
     return field_flag(model, name).otherwise or ("" if default in (None, False, ()) else str(default))
 
@@ -82,7 +85,7 @@ def _limit(constraints: Sequence[Any], name: str) -> Any:
 
 
 def expanded(command: Callable[..., Any], groups: Mapping[str, Group]) -> Callable[..., Any]:
-    """Return a command with a group of flags in the place of each named parameter."""
+    """Return a command in which each parameter named in `groups` is replaced by its group of flags."""
     parameters: list[inspect.Parameter] = []
     for parameter in inspect.signature(command, eval_str=True).parameters.values():
         if parameter.name in groups:

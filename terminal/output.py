@@ -1,4 +1,4 @@
-"""Standard output and standard error: lines for people, JSON lines for programs."""
+"""Output on standard output and standard error: text lines for people, and JSON lines for programs."""
 
 import contextlib
 import json
@@ -18,11 +18,11 @@ from terminal.logs import LogFormat, formatted, log_format, relayed, write_line,
 from terminal.one_line import one_line
 
 ERROR_DESCRIPTOR: Final = "ROSBAYES_ERROR_DESCRIPTOR"
-"""Environment variable with the descriptor on which a child reports its error to its parent, a JSON object per line."""
+"""Environment variable with the file descriptor to which a child writes its error for its parent, as a JSON line."""
 
 
 def say(text: str) -> None:
-    """Print one line for the user on standard error; do nothing if standard error is closed."""
+    """Print one line for the user on standard error. If standard error is closed, do nothing."""
     write_line(formatted("info", one_line(text)))
 
 
@@ -32,7 +32,7 @@ def warn(sentence: str, *, name: str = "") -> None:
 
 
 def say_error(sentence: str) -> None:
-    """Print the error that ends this process, or send it to the parent, which then prints it."""
+    """Print the error that ends this process. If `ERROR_DESCRIPTOR` is set, send the error to the parent instead."""
     descriptor = os.environ.get(ERROR_DESCRIPTOR, "")
     if descriptor.isdigit():
         with contextlib.suppress(OSError):  # the parent may be gone
@@ -42,9 +42,9 @@ def say_error(sentence: str) -> None:
 
 
 def show_progress(text: str) -> None:
-    """Show the progress of this command in one line of the terminal, which the next line replaces.
+    """Show the progress of this command in one line of the terminal. The next output replaces the line.
 
-    With JSON log lines, each call writes a line of its own.
+    In the JSON log format, each call writes a new line.
     """
     if log_format() is LogFormat.JSON:
         say(text)
@@ -71,12 +71,12 @@ def say_lines(text: str) -> None:
 
 
 def relay(line: str, process: str) -> None:
-    """Print on standard error a line that a child has printed there."""
+    """Print a line from the standard error of a child process on the standard error of this process."""
     write_line(relayed(line, process))
 
 
 def print_json_line(value: Any) -> None:
-    """Print a line of JSON on standard output, free of terminal control characters."""
+    """Print a value as a line of JSON on standard output. Terminal control characters are escaped."""
     line = orjson.dumps(value)
     if not line.isascii():  # orjson escapes only the control characters of ASCII
         text = line.decode()
@@ -86,7 +86,7 @@ def print_json_line(value: Any) -> None:
 
 
 def open_standard_streams() -> None:
-    """Open /dev/null for closed standard streams (`>&-`), so that no other file gets their descriptors."""
+    """Open /dev/null for each closed standard stream (`>&-`), so that no other file gets the stream's descriptor."""
     for number, (name, mode) in enumerate((("stdin", "r"), ("stdout", "w"), ("stderr", "w"))):
         try:
             os.fstat(number)
@@ -99,7 +99,7 @@ def open_standard_streams() -> None:
 
 
 def discard_output() -> None:
-    """Redirect standard output to /dev/null, so that flushing it at exit cannot fail again."""
+    """Redirect standard output to /dev/null after a failed write, so that flushing it at exit does not fail too."""
     with contextlib.suppress(OSError), Path(os.devnull).open("wb") as null:
         os.dup2(null.fileno(), sys.stdout.fileno())
 

@@ -1,4 +1,4 @@
-"""Images as ROS messages: read and write sensor_msgs/Image, write stereo_msgs/DisparityImage, pair by stamps."""
+"""Conversion of sensor_msgs/Image and stereo_msgs/DisparityImage, and pairing of stereo images by their stamps."""
 
 import base64
 import binascii
@@ -22,11 +22,14 @@ _WAITING: Final = 16
 
 
 class BadImageError(Exception):
-    """A message is not an image of one of the encodings that are expected."""
+    """A message is not a usable image, for example because of its encoding or because it has no stamp."""
 
 
 def read_image(message: Mapping[str, Any], *encodings: str) -> NDArray[Any]:
-    """Return a sensor_msgs/Image in one of `encodings` as an array [height, width], or raise a BadImageError."""
+    """Return the pixels of a sensor_msgs/Image as an array [height, width].
+
+    Raises a BadImageError if its encoding is not in `encodings`, or if its data are unusable.
+    """
     encoding = message.get("encoding")
     if encoding not in encodings:
         raise BadImageError(f"its encoding is {str(encoding)[:20]!r}, expected {' or '.join(encodings)}")
@@ -58,7 +61,7 @@ def read_image(message: Mapping[str, Any], *encodings: str) -> NDArray[Any]:
 def image_message(
     image: NDArray[Any], head: Mapping[str, Any], encoding: Literal["mono8", "32FC1"]
 ) -> dict[str, Any]:
-    """Return an array [height, width] as a sensor_msgs/Image."""
+    """Return pixels, an array [height, width], as a sensor_msgs/Image with the header `head`."""
     pixels = np.ascontiguousarray(image, dtype=np.dtype(_DTYPES[encoding]).newbyteorder("<"))
     height, width = pixels.shape
     return {
@@ -83,8 +86,8 @@ def disparity_message(
 ) -> dict[str, Any]:
     """Return disparities in pixels, float64[height, width], as a stereo_msgs/DisparityImage.
 
-    Negative disparities are unknown, as for stereo_image_proc. If the focal length is unknown, the
-    message has the image's width in its place. The baseline is `T` in ROS 1 and `t` in ROS 2.
+    A negative disparity means unknown, as in stereo_image_proc. If `focal_px` is None, the message gives the image's
+    width as the focal length. The field of the baseline is `T` in ROS 1 and `t` in ROS 2.
     """
     height, width = disparity.shape
     window = {"x_offset": 0, "y_offset": 0, "height": height, "width": width, "do_rectify": False}
@@ -102,7 +105,7 @@ def disparity_message(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StereoImages:
-    """The left and right image of one instant, uint8[height, width], and the header of the left one."""
+    """A left and a right image with the same stamp, uint8[height, width], and the header of the left image."""
 
     stamp_ns: int
     head: Mapping[str, Any]
@@ -153,7 +156,7 @@ class ImagePairs:
         return StereoImages(stamp_ns=stamp_ns, head=left["header"], left=images[0], right=images[1])
 
     def silence(self, left: str, right: str) -> str:
-        """Return a sentence on why no pair comes, which names the topics `left` and `right`."""
+        """Return a sentence that explains why no pair arrives. `left` and `right` are the topics of the cameras."""
         if all(self.unpaired):
             return f"images come on {left} and {right}, but no two with equal stamps: synchronise the cameras"
         if not any(self.unpaired):

@@ -1,9 +1,9 @@
-"""Peers of a run that starts subscriber and publisher for every message, as the thesis probably did (3.1, 3.3).
+"""A run that starts subscriber and publisher again for every message, as the thesis probably did (3.1, 3.3).
 
     subscriber starts ─▶ a reading ─▶ it ends ─▶ publisher starts ─▶ pcie-app ─▶ a result ─▶ it ends ─▶ subscriber ...
 
-The time from one result to the next contains both starts. pcie-app and the boards stay. A first
-publisher, which finds out whether the server accepts the topics, ends when the run begins.
+The time from one result to the next includes both starts. pcie-app and the boards run all the time. The first
+publisher only checks whether the server accepts the topics, and ends when the run begins.
 """
 
 import asyncio
@@ -16,7 +16,7 @@ from services.sockets.records import AnyRecord, Outcome, Published, Reading, Rea
 
 
 class EachMessagePeers(Peers):
-    """The three services; for each message, a new subscriber and a new publisher are started."""
+    """The three services of a run. For each message, a new subscriber and a new publisher are started."""
 
     # Peers that have done their work and were told to end, until they have ended. Their records are ignored: another
     # reading arrived together with the one that was taken, and is missed as if nobody had subscribed.
@@ -27,7 +27,7 @@ class EachMessagePeers(Peers):
     _changed: asyncio.Event
 
     def prepare(self) -> None:
-        """Determine the peers; raise a SettingsError if the master does not start subscriber and publisher."""
+        """Determine the peers. Raises a SettingsError unless the master itself starts both subscriber and publisher."""
         self._done, self._publishing, self._changed = set(), False, asyncio.Event()
         super().prepare()
         if self.subscriber.child is None or self.publisher.child is None:

@@ -1,4 +1,4 @@
-"""Output of results by `master`: one JSON object per line, one sentence, or the newest posterior to draw."""
+"""Output of the master's results: a line of JSON, a sentence, or a posterior for drawing."""
 
 import time
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ def print_json(record: Published, deployment: Deployment) -> None:
 
 
 def sentence(record: Published, deployment: Deployment) -> str:
-    """Return a result as a line of text, worded like the lines of `listen`."""
+    """Return a result as a line of text, in the wording of `listen`."""
     axes = deployment_axes(deployment)
     return (
         f"frame {record.number}: {in_words(axes, _cell(axes, record.best_line))} with {record.best_probability:.3g}; "
@@ -57,7 +57,7 @@ def _cell(axes: Sequence[Axis], line: int) -> dict[str, int]:
 
 
 def posterior_of(publish: Publish, deployment: Deployment) -> Posterior | None:
-    """Return the posterior of a computed frame with its report, or None if all counts were 0."""
+    """Return the posterior of a computed frame, with the frame's report, or None if all counts were 0."""
     inference = infer(publish.result, deployment)
     if inference.posterior is None:
         return None

@@ -1,4 +1,4 @@
-"""Findings of checks, and the checks of a BM1's codes: lines that never count, readings without a posterior."""
+"""Findings of checks, and the checks of a BM1's codes for lines that never count and readings without a posterior."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ class Severity(StrEnum):
 
 
 class Check(StrEnum):
-    """The checks, as `toolchain check --json` names them; docs/reference/toolchain.md describes each."""
+    """The names of checks in `toolchain check --json`. docs/reference/toolchain.md describes each check."""
 
     CANNOT_BE_BUILT = "cannot-be-built"
     DEAD_LINES = "dead-lines"
@@ -102,7 +102,7 @@ class CheckedMachine:
 
     @property
     def parameters(self) -> BM1Parameters:
-        """The parameters of the first board; only the lines differ between boards."""
+        """The parameters of the first board. The other boards differ only in their lines."""
         return self.board.parameters
 
     @property
@@ -118,7 +118,7 @@ class CheckedMachine:
         return _addressable(self.deployment.sensors[column], self.tables[column])
 
     def prior_rows(self) -> NDArray[np.uint16]:
-        """Return the rows of the prior that a reading can select; without a selecting variable, all rows."""
+        """Return the rows of the prior that a reading can select. If no variable selects the prior, return all rows."""
         select = self.deployment.prior_select
         return self.prior if select is None else _addressable(select, self.prior)
 
@@ -133,7 +133,7 @@ _LOST_OFTEN: Final = 0.02
 
 
 def code_findings(machine: CheckedMachine) -> Iterator[Finding]:
-    """Find dead lines, impossible readings, columns without effect, and a target that is never reached."""
+    """Find lines that never count, impossible readings, columns without effect, and an unreachable target count."""
     yield from _lines(machine)
     yield from _readings(machine)
     yield from _columns(machine)
@@ -141,7 +141,10 @@ def code_findings(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def loss_findings(quantised: Quantised, options: BuildOptions) -> Iterator[Finding]:
-    """Find outlier floors (least likelihoods) that become code 0; warn if many frames have code 0 on the true line."""
+    """Find outlier floors that become code 0, and models in which the true line often has code 0.
+
+    An outlier floor is the minimum likelihood of a reading.
+    """
     for floor in quantised.floors:
         yield warning(Check.VANISHED_FLOOR, floor.name, floor.what, floor.advice)
     mass = sum(loss.mass for loss in quantised.losses)
@@ -155,7 +158,7 @@ def loss_findings(quantised: Quantised, options: BuildOptions) -> Iterator[Findi
 
 
 def line_name(searched: Sequence[Dimension], line: int) -> str:
-    """Return a line as text, by its values of the searched variables: `y = 1.5, x = 3`."""
+    """Return a line as text, with the value of each searched variable: `y = 1.5, x = 3`."""
     places = np.unravel_index(line, [dimension.size for dimension in searched])
     return ", ".join(
         f"{dimension.label} = {dimension.states[at] if dimension.states else f'{dimension.value(float(at)):g}'}"
@@ -164,7 +167,7 @@ def line_name(searched: Sequence[Dimension], line: int) -> str:
 
 
 def reading(variable: Variable, address: int) -> str:
-    """Return a value of a variable as text for the user: `3.5`, `open`, or `a missing reading`."""
+    """Return the reading at an address as text for the user: `3.5`, `open`, or `a missing reading`."""
     if address >= variable.values:
         return "a missing reading"
     if variable.states:

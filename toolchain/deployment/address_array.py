@@ -1,8 +1,8 @@
-"""Conversion of arrays of readings (one per line, one per replica, or both) to addresses or codes (thesis 4.4).
+"""Conversion of arrays of readings to addresses or codes (thesis 4.4).
 
-Each number is converted as in `toolchain.deployment.address`. The numbers of an array are in the order replica after
-replica, and line after line in each. A reading of a sensor is missing either on all lines of a machine or on none.
-Likelihoods (`sensor_mode = threshold`) and written priors become codes.
+An array has a reading for each line, for each replica, or for each line of each replica. All lines of the first
+replica come first. Each number is converted as in `toolchain.deployment.address`. A reading of a sensor is missing
+either on all lines of a machine or on none. Likelihoods (`sensor_mode = threshold`) and written priors become codes.
 """
 
 import base64
@@ -78,7 +78,7 @@ def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int, replicas: int
 
 
 MISSING: Final = -1
-"""The address that stands for a missing reading, on all lines of a machine."""
+"""Address of a missing reading. All lines of a machine have this address if a reading is missing."""
 
 
 def to_addresses(deployment: Deployment, variable: Variable, value: object) -> list[int] | None:
