@@ -1,4 +1,4 @@
-"""Names of ROS topics, services and types, in ROS 1 (`pkg/Type`) and ROS 2 (`pkg/msg/Type`).
+"""Names of ROS topics and services, and names of types in ROS 1 (`pkg/Type`) and ROS 2 (`pkg/msg/Type`).
 
 Sources: http://wiki.ros.org/Names, https://design.ros2.org/articles/topic_and_service_names.html.
 """
@@ -13,7 +13,7 @@ Kind = Literal["msg", "srv", "action"]
 RosVersion = Literal[1, 2]
 
 MAX_NAME = 255
-"""Maximum length of a name in characters; ROS 2 allows 255 for a topic."""
+"""Maximum length of a name in characters. ROS 2 has this limit for the name of a topic."""
 
 _TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:(msg|srv|action)/)?([A-Za-z][A-Za-z0-9_]*)")
 _TOPIC = re.compile(r"[~/]?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*")
@@ -37,13 +37,13 @@ def split_type(name: str) -> tuple[str, str, str]:
 
 
 def ros1_type(name: str) -> str:
-    """Return the ROS 1 form of a type name: `std_msgs/String`."""
+    """Return the ROS 1 form of a type name, such as `std_msgs/String`."""
     package, _kind, own = split_type(name)
     return f"{package}/{own}"
 
 
 def ros2_type(name: str, kind: Kind = "msg") -> str:
-    """Return the ROS 2 form of a type name, `std_msgs/msg/String`, with `kind` if the name has none."""
+    """Return the ROS 2 form of a type name, such as `std_msgs/msg/String`. A name without a kind gets `kind`."""
     package, its_kind, own = split_type(name)
     return f"{package}/{its_kind or kind}/{own}"
 
@@ -65,7 +65,7 @@ def same_type(one: str, other: str) -> bool:
 
 
 def ros_version_of_type(name: str) -> RosVersion | None:
-    """Return the ROS version whose form a type name has, or None if the name is malformed."""
+    """Return the ROS version in whose form a type name is written, or None if the name is malformed."""
     try:
         return 2 if split_type(name)[1] else 1
     except NameFormError:
@@ -73,7 +73,7 @@ def ros_version_of_type(name: str) -> RosVersion | None:
 
 
 def check_name(name: str) -> str:
-    """Return the name of a topic or a service, or raise a NameFormError; relative names are valid."""
+    """Return a valid name of a topic or service unchanged, or raise a NameFormError. Relative names are valid."""
     if len(name) > MAX_NAME:
         raise NameFormError(
             f"name {name[:40]!r}... has {len(name)} characters, at most {MAX_NAME} are allowed"
@@ -87,5 +87,5 @@ def check_name(name: str) -> str:
 
 
 def absolute(name: str) -> str:
-    """Return the name with a leading slash, which some clients omit."""
+    """Return a name with a leading slash. The slash is added if the name has none."""
     return name if name.startswith("/") else "/" + name

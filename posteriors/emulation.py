@@ -1,4 +1,4 @@
-"""The posterior of a deployment for given readings, computed in this process: for notebooks and tests of models."""
+"""The posterior of a deployment for given readings, emulated in this process for notebooks and tests of models."""
 
 import time
 from collections.abc import Mapping
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True, repr=False)
 class EmulatedPosterior(Posterior):
-    """The result of the function `posterior`, which can be compared with the exact posterior for the same readings."""
+    """The result of the function `posterior`. Its method `exact` returns the exact posterior for the same readings."""
 
     deployment: Deployment = field(compare=False)
     machines: tuple[Any, ...] = field(compare=False)
-    """The emulated machines of the boards, kept for `exact`, because the deployment's folder may change later."""
+    """The emulated machines of the boards. `exact` uses them, because the deployment's folder may change meanwhile."""
     addresses: tuple[int | None, ...]
-    """The address of each variable's reading, in the order of the deployment; None for a missing reading."""
+    """One address for each variable, in the order of the deployment. None stands for a missing reading."""
 
     def exact(self, model: "Path | str | Model | Question | None" = None, **settings: object) -> Posterior:
         """Return the exact posterior for the same readings, by inference in float64.

@@ -1,4 +1,4 @@
-"""`/bm/frame`: the report of each frame, written and read with the same keys."""
+"""The report of each frame on the topic `/bm/frame`. Writing and reading use the same keys."""
 
 import math
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ FRAME_TYPE: Final = "diagnostic_msgs/DiagnosticArray"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageTimes:
-    """Durations of the stages of a frame in microseconds, None if not reported (thesis figure 4.5)."""
+    """The duration of each stage of a frame in microseconds, or None if it is not reported (thesis figure 4.5)."""
 
     rosbridge_in: FiniteFloat | None = None
     local_hops: FiniteFloat | None = None
@@ -30,12 +30,12 @@ class StageTimes:
     reads: FiniteFloat | None = None
     boards_compute: FiniteFloat | None = None
     rosbridge_out: FiniteFloat | None = None
-    """The time for sending the previous posterior, because a report is sent before the posterior of the same frame."""
+    """The time to send the previous frame's posterior. A report is sent before the posterior of its own frame."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoardReport:
-    """The outcome of a frame on one board, and on each of its replicas."""
+    """The outcome of a frame on one board, and on each replica of the board."""
 
     name: str
     stopped: str
@@ -57,16 +57,16 @@ class VariableReading(NamedTuple):
     """The reading of a variable in a frame."""
 
     value: Annotated[float | str, BeforeValidator(_number_or_text)]
-    """As received, to nine digits: a number, or text if it is the name of a state or a number that is not finite."""
+    """The received value, to nine digits. The name of a state is a text, and so is a number that is not finite."""
     address: int
     """Address in the variable's column."""
     age_ms: FiniteFloat
-    """Milliseconds from the receipt of the variable's message to the sending of the report."""
+    """Age of the variable's message in milliseconds when the report is sent, counted from the message's receipt."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameReport:
-    """A `/bm/frame` message; attributes that end in `_ns` are Unix times in nanoseconds."""
+    """The content of a `/bm/frame` message. Attributes that end in `_ns` are Unix times in nanoseconds."""
 
     stamp_ns: int
     """Time of the reading."""
@@ -83,9 +83,9 @@ class FrameReport:
     link_transfers: int | None = None
     """Number of transfers that carried the `link_bytes`."""
     received_ns: int | None = None
-    """Time at which the subscriber received the reading (Unix time)."""
+    """Time at which the subscriber received the reading."""
     sent_ns: int | None = None
-    """Time at which the posterior was sent (Unix time)."""
+    """Time at which the posterior was sent."""
     stages: StageTimes = StageTimes()
     boards: tuple[BoardReport, ...] = ()
     details: Mapping[str, str] = field(default_factory=dict)
@@ -93,7 +93,7 @@ class FrameReport:
     missing: tuple[str, ...] = ()
     """Names of the variables without a reading."""
     readings: Mapping[str, VariableReading] = field(default_factory=dict)
-    """Readings by the names of their variables; readings that are arrays are left out."""
+    """The reading of each variable, by the variable's name. Readings that are arrays are left out."""
 
     @property
     def is_biased(self) -> bool:
@@ -101,9 +101,9 @@ class FrameReport:
         return "ended_early" in self.details
 
     def link_us(self, rate: str) -> float | None:
-        """Return the modelled microseconds of the frame's transfers, one after another, on a link of this rate.
+        """Return the modelled time in microseconds for all transfers of the frame, made one after another.
 
-        `rate` is a value of --link-rate. None if the report has no bytes.
+        `rate` is a value of `--link-rate`. If the report has no bytes or no transfers, the result is None.
         """
         if self.link_bytes is None or self.link_transfers is None:
             return None
@@ -154,7 +154,7 @@ def _status(keys: tuple[str, ...], head: tuple[object, ...], values: tuple[objec
 
 
 def write_frame_report(report: FrameReport, ros_version: Literal[1, 2]) -> dict[str, Any]:
-    """Return a report as a diagnostic_msgs/DiagnosticArray, without the values that are not known."""
+    """Return a report as a diagnostic_msgs/DiagnosticArray. Unknown values (None) are left out."""
     frame = _status(
         _OF_FRAME,
         (
@@ -232,7 +232,7 @@ _REPORT: Final = TypeAdapter(FrameReport)
 
 
 def read_frame_report(message: dict[str, Any], heard_ns: int) -> FrameReport:
-    """Return the report in a diagnostic_msgs/DiagnosticArray, or raise a BadResultError; any key may be absent."""
+    """Return the report in a diagnostic_msgs/DiagnosticArray, or raise a BadResultError. Every key is optional."""
     array = validated(_ARRAY, message, FRAME_TOPIC, FRAME_TYPE)
     first, *others = array.status
     values = first.by_key()

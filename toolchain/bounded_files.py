@@ -1,4 +1,4 @@
-"""Files of bounded size and depth: read with errors that name file and line, and replaced as a whole when written."""
+"""Files of bounded size and depth. Errors of reading name file and line, and writing replaces the whole file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _PIECE: Final = 1 << 18
 
 @contextmanager
 def file_errors(path: Path, done: str, error: type[ToolchainError], advice: str = "") -> Iterator[None]:
-    """Convert an OSError in the block to `error`: the file cannot be "read" or "written", as `done` says."""
+    """Convert an OSError in the block to `error`. `done` says what failed: the file cannot be "read" or "written"."""
     try:
         yield
     except OSError as reason:
@@ -53,7 +53,7 @@ def open_regular(path: Path, error: type[ToolchainError], most: int | None = Non
 
 
 def read_bounded(path: Path, most: int, error: type[ToolchainError]) -> bytes:
-    """Return the content of a regular file of at most `most` bytes, or raise the error."""
+    """Return the content of a regular file of at most `most` bytes, or raise `error`."""
     with file_errors(path, "read", error), open_regular(path, error, most) as file:
         pieces, size = [], 0
         while size <= most and (piece := file.read(_PIECE)):  # read(most) would allocate that much at once
@@ -66,9 +66,9 @@ def read_bounded(path: Path, most: int, error: type[ToolchainError]) -> bytes:
 
 @contextmanager
 def whole_file(path: Path, error: type[ToolchainError]) -> Iterator[Path]:
-    """Yield the path of a partial file, which replaces the file at the end of the block.
+    """Yield the path of a temporary file, which replaces the file at `path` at the end of the block.
 
-    If the partial file is removed in the block, the file does not change.
+    If the block fails or removes the temporary file, the file at `path` does not change.
     """
     partial = path.with_name(path.name + ".part")
     try:
@@ -106,17 +106,17 @@ class TomlFile:
     """The content of a TOML file."""
 
     path: Path
-    """Its path."""
+    """Path of the file."""
     error: type[ToolchainError]
-    """The type of its errors."""
+    """Type of the errors about the file."""
     text: str
-    """Its text, in which the lines of mistakes are looked up."""
+    """Text of the file. Errors look up the lines of mistakes in it."""
     tables: dict[str, Any]
-    """Its tables, not yet validated."""
+    """Tables of the file, before their validation."""
 
     @classmethod
     def read(cls, path: Path, error: type[ToolchainError]) -> Self:
-        """Read a file of bounded size and depth; the error names the line."""
+        """Read a file of bounded size and depth, or raise `error` with the line of the mistake."""
         data = read_bounded(path, _MOST_BYTES, error)
         try:
             text = data.decode()
@@ -138,7 +138,7 @@ class TomlFile:
             raise error(_PLACE.sub("", str(reason)), path=path, line=line) from None
 
     def validated(self, model: type[Model]) -> Model:
-        """Return the tables as a pydantic model, by field aliases; errors give line and nearest valid name."""
+        """Return the tables as a pydantic model, by field aliases. An error names the line and the nearest valid name."""
         try:
             return model.model_validate(self.tables, by_alias=True, by_name=False)
         except ValidationError as reason:
@@ -148,7 +148,7 @@ class TomlFile:
             raise self._wrong_value(model, first) from None
 
     def mistake(self, place: tuple[str | int, ...], sentence: str) -> ToolchainError:
-        """Return an error about a key, with its line."""
+        """Return an error about the key at `place`, with the line of the key."""
         return self.error(sentence, path=self.path, line=self._line_of(place), place=place)
 
     def _line_of(self, place: Sequence[str | int]) -> int | None:
@@ -224,7 +224,7 @@ def _split(place: Sequence[str | int]) -> tuple[str, int | None, str]:
 
 
 def nearest_name(word: str, known: Sequence[str], *, cutoff: float = 0.5) -> str:
-    """Return advice on a wrong name: the nearest valid name, or the first valid ones."""
+    """Return advice on a wrong name. It gives the nearest valid name or, if none is near, a list of valid names."""
     close = difflib.get_close_matches(word, known, n=1, cutoff=cutoff)
     if close:
         return f"did you mean '{close[0]}'?"

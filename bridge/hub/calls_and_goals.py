@@ -62,7 +62,7 @@ _CANCEL_ALL: Final = "/_action/cancel_goal"
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """A client that waits for an answer, and the id, name and encoding that its request named."""
+    """A client that waits for an answer, with its request's id, encoding, and name of the service or action."""
 
     client: Client
     id: OperationId
@@ -72,7 +72,7 @@ class Caller:
 
     @classmethod
     def of(cls, client: Client, operation: Operation, kind: str) -> Self:
-        """Read the caller from an operation that names a service or an action, or raise a RefusedOperationError."""
+        """Read the caller from an operation, or raise a RefusedOperationError. `kind` is `service` or `action`."""
         return cls(
             client,
             operation_id(operation),
@@ -218,7 +218,7 @@ class Calls(_Exchange):
         rosapi: Rosapi,
         answer_here: Callable[[Client, str], dict[str, Any] | None],
     ) -> None:
-        """Start without services; `answer_here` answers calls of the hub's own services, or returns None."""
+        """Start without services. `answer_here` answers a service of the hub itself, or returns None for another name."""
         super().__init__(limits, dispatcher, definitions, graph.services, lambda client: client.services)
         self._graph = graph
         self._rosapi = rosapi
@@ -230,7 +230,7 @@ class Calls(_Exchange):
 
     @property
     def deadline(self) -> float:
-        """Time at which to call `expire` next, infinity for never."""
+        """Time at which to call `expire` next, or infinity if it need not be called."""
         return self._deadlines[0][0] if self._deadlines else inf
 
     def leave(self, client: Client) -> None:
@@ -413,7 +413,7 @@ class Actions(_Exchange):
         self._send_cancel(goal)
 
     def cancel_all(self, client: Client, service: str) -> dict[str, Any] | None:
-        """Answer `ACTION/_action/cancel_goal` by cancelling the client's goals; return None for other services."""
+        """Answer `ACTION/_action/cancel_goal` by cancelling the client's goals. Return None for any other service."""
         name = service.removesuffix(_CANCEL_ALL)
         if name == service or name not in self._offers:
             return None
@@ -423,7 +423,7 @@ class Actions(_Exchange):
         return {"return_code": 0, "goals_canceling": []}
 
     def feed_back(self, client: Client, operation: Operation, now: float) -> None:
-        """Perform `action_feedback`; for a caller that reads slowly, the oldest feedback is dropped."""
+        """Perform `action_feedback`. If the sender of the goal reads slowly, the oldest feedback is dropped."""
         goal = self._goal_of(client, operation)
         values = operation.get("values", {})
         if not isinstance(values, dict):

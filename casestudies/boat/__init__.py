@@ -1,1 +1,1 @@
-"""The boat of thesis 2.1.2.1 and chapter 4, which locates itself by distances and bearings to three beacons."""
+"""A boat that locates itself by its distances and bearings to three beacons (thesis 2.1.2.1 and chapter 4)."""

@@ -1,1 +1,1 @@
-"""The host side of the link: links to boards, the mini-cluster that drives them, and the loader."""
+"""The host's side: links to boards, the driver of a mini-cluster of boards, and the loader."""

@@ -1,4 +1,4 @@
-"""Conversion of frames to input of the driver, and of the driver's results to records."""
+"""Conversion of frames to the driver's input, and of the driver's results to records."""
 
 import math
 from collections.abc import Sequence
@@ -22,7 +22,7 @@ PriorRow = int | tuple[int, ...]
 
 
 class BoardAwayError(BoardError):
-    """Raised while a board that failed an earlier frame is not back yet."""
+    """Raised while a board that failed an earlier frame is not available again yet."""
 
 
 def driver_input(deployment: Deployment, frame: FrameRequest, stop: str) -> FrameInput:
@@ -59,7 +59,7 @@ def driver_input(deployment: Deployment, frame: FrameRequest, stop: str) -> Fram
 
 
 def machine_inputs(deployment: Deployment, addresses: Addresses) -> tuple[npt.NDArray[np.int64], PriorRow]:
-    """Return a frame's inputs (-1 for a missing one) and its row of the prior, for a machine that reads arrays."""
+    """Return a frame's inputs and its row of the prior, for a machine that reads arrays. A missing input is -1."""
     variables = deployment.variables
     if len(addresses) != len(variables):
         raise FrameInputError(
@@ -105,7 +105,7 @@ def _row(deployment: Deployment, variable: Variable, given: int | list[int] | No
 
 
 def encode_boards(boards: Sequence[BoardResult]) -> msgspec.Raw:
-    """Encode the boards' results for `FrameResult.boards`, which the master forwards without decoding it."""
+    """Encode the boards' results for `FrameResult.boards`."""
     return msgspec.Raw(_encoder.encode(boards))
 
 
@@ -129,6 +129,6 @@ def result_record(number: int, output: FrameOutput) -> FrameResult:
 
 
 def frame_failed(number: int, error: BoardError) -> FrameFailed:
-    """Return the error of a board as the record of a failed frame."""
+    """Return a record that says that frame `number` failed because of a board's error."""
     reason = FailureReason.AWAY if isinstance(error, BoardAwayError) else FailureReason.FAILED
     return FrameFailed(number, error.board, exit_code_of(error), str(error), reason)

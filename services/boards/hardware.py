@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Engine(StrEnum):
-    """The implementation of the machine behind a board's registers."""
+    """The implementation of a board's machine: an emulation, or a simulator of the hardware."""
 
     EMULATED = "emulated"
     RTL = "rtl"
@@ -33,7 +33,7 @@ class SimulatedHardware:
     """The simulator that `board --engine` selects, and the boards simulated with it."""
 
     def __init__(self, engine: Engine, folder: Path, images: Mapping[int, Image]) -> None:
-        """Choose the simulator, and compile the given images of boards into the folder.
+        """Choose the simulator, and compile the images into `folder`. The keys of `images` are the numbers of boards.
 
         Raises:
             SettingsError: The simulator is not installed, or the VHDL is missing.

@@ -25,11 +25,11 @@ from toolchain.deployment import Deployment
 
 ROLE = "publisher"
 RESULTS_DEPTH = 64
-"""Maximum number of results that wait for the rosbridge server; the master has fewer in flight."""
+"""Maximum number of results that wait for the rosbridge server. The master has fewer frames under way."""
 
 
 def same_numbers(received: Any, sent: list[float], *, rel_tol: float = 1e-12, abs_tol: float = 0.0) -> bool:
-    """Return whether a received array equals the sent one, within tolerances, as some servers lose the last bit."""
+    """Return whether two arrays are equal within tolerances. Some servers lose the last bit of a number."""
     return (
         isinstance(received, list)
         and len(received) == len(sent)
@@ -73,7 +73,7 @@ class ResultTopics:
 
     @contextlib.asynccontextmanager
     async def opened(self, on_state: OnState | None = None) -> AsyncIterator[str]:
-        """Connect and advertise, and yield a sentence with topics and servers, or raise a BridgeError."""
+        """Connect to the servers and advertise the topics, or raise a BridgeError. Yield a sentence that names both."""
         settings, deployment = self._settings, self._deployment
         by_uri = self.rosbridges
         async with contextlib.AsyncExitStack() as stack:
@@ -95,7 +95,7 @@ class ResultTopics:
             yield f"publishing on {topics} at {', '.join(by_uri)}"
 
     def served_by(self, uri: str) -> tuple[str, str]:
-        """Return two texts for the user: a server's topics (empty if it is the only server), and its name."""
+        """Return two texts about a server: its topics and its name. For the only server, the first text is empty."""
         if len(self.rosbridges) == 1:
             return "", "rosbridge"
         topics = [publication.topic for ros, publication in self._outputs if ros is self.rosbridges.get(uri)]
@@ -103,13 +103,16 @@ class ResultTopics:
         return which, f"rosbridge at {uri}"
 
     def watch(self) -> None:
-        """Subscribe to the first output, so that `seen` can tell whether a result comes back."""
+        """Subscribe to the first output topic, so that `seen` can tell whether a published result comes back."""
         if self._watched is None:
             output = self._deployment.outputs[0]
             self._watched = self._outputs[0][0].subscribe(output.topic, output.type, queue_size=RESULTS_DEPTH)
 
     async def seen(self, timeout: float) -> bool:
-        """Return whether a result published since `watch` comes back in time; if so, stop watching."""
+        """Return whether a result published since `watch` comes back within `timeout` seconds.
+
+        If a result comes back, the subscription ends.
+        """
         if self._watched is None:
             return False
         # results of other publishers of the topic may arrive before
@@ -133,7 +136,7 @@ class ResultTopics:
 
     @property
     def must_wait(self) -> bool:
-        """True while no server is connected, or earlier messages still wait for one."""
+        """True while no server is connected, or a connected server has not accepted earlier messages yet."""
         connected = self._connected()
         return not connected or any(publication.must_wait for publication in connected)
 
@@ -141,9 +144,9 @@ class ResultTopics:
         return [publication for ros, publication in self._outputs if ros.state is State.CONNECTED]
 
     async def publish(self, publish: Publish, *, look: bool) -> Published:
-        """Publish the report of a frame and then its posterior, if any, when the servers accept them.
+        """Wait until the servers accept messages, then publish a frame's report and, if there is one, its posterior.
 
-        With `look`, wait until the result comes back from the server, for at most the setting `seen_timeout`.
+        With `look`, then wait until the result comes back from the server, or for the seconds of `seen_timeout`.
         """
         inference = infer(publish.result, self._deployment)
         # a server that does not accept the result in time does not get it, and the user is warned
@@ -162,10 +165,10 @@ class ResultTopics:
         return published
 
     def publish_now(self, publish: Publish, inference: Inference | None = None) -> Published:
-        """Publish the report and the posterior on all servers that accept them now, and return the outcome.
+        """Publish a frame's report and posterior without waiting, and return the outcome.
 
-        The report goes to the server of the first output. A result counts as published if it went to at least
-        one output.
+        The report goes to the server of the first output. The posterior goes to every output whose server accepts it
+        now. It counts as published if at least one server accepted it.
         """
         started = time.monotonic_ns()
         inference = inference or infer(publish.result, self._deployment)

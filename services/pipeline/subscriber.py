@@ -3,7 +3,8 @@
     topic ──message──▶ _follow ──▶ FrameAssembler.take ──readings──▶ _forward ──Reading──▶ master
     timer ───────────▶ _wake ────▶ FrameAssembler.due ───readings──▶
 
-The timer runs while a set of messages waits for a topic that may be missing. In a simulation, `/clock` replaces it.
+The timer runs while a set of messages waits for a topic that may be missing. In a simulation, messages of
+`/clock` replace the timer.
 """
 
 import asyncio
@@ -43,9 +44,9 @@ _BACKLOG_LIMIT = min(1 << 18, MAX_RECORD)
 
 
 async def newest_message(subscription: Subscription, message: Message) -> tuple[Message, int]:
-    """Return the newest message that waits at the start of a subscription, and the number of older ones.
+    """Skip older messages at the start of a subscription. Return the newest message, and the number of skipped ones.
 
-    ROS 2 servers first send a backlog from before the subscription in one burst, the oldest message first.
+    `message` is the subscription's first message. A ROS 2 server begins with a burst of earlier messages, in order.
     """
     older = 0
     with contextlib.suppress(TimeoutError):
@@ -58,7 +59,7 @@ async def newest_message(subscription: Subscription, message: Message) -> tuple[
 
 
 class Subscriber(RunService):
-    """Service that sends readings of a deployment's topics to a master, as addresses in the variables' columns."""
+    """Service that converts messages of a deployment's topics to addresses, and sends them to a master as readings."""
 
     role = ROLE
 

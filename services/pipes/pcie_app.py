@@ -1,4 +1,4 @@
-"""`pcie-app` without a master, which computes the readings of standard input and prints counts."""
+"""`pcie-app` without a master. It computes the readings of standard input on boards, and prints the counts."""
 
 from collections.abc import Mapping
 
@@ -17,7 +17,7 @@ from terminal.output import print_json_line, say, say_if_slow
 
 
 def reading_from_line(line: bytes, number: int) -> LineReading:
-    """Return the reading of one line of standard input, or raise an InputLineError."""
+    """Decode the reading in line `number` of standard input, or raise an InputLineError."""
     reading: LineReading = decoded(
         line, number, LineReading, 'a reading such as {"addresses": [12, null, 7]}'
     )

@@ -26,21 +26,21 @@ from importlib.metadata import version
 import msgspec
 
 VERSION = version("rosbayes")
-"""Version in every hello, which must be the same on both sides of a local socket."""
+"""Version of this software, sent in every `Hello`. It must be the same on both sides of a local socket."""
 
 
 # --- words that the user sees in `status`, in metrics and at the end of a run ----------------------
 
 
 class LossReason(StrEnum):
-    """Reason why a reading has no result, or no result on some topics; shown by `status`."""
+    """Reason why a reading has no result on some or all topics. `status` shows the reason."""
 
     PASSED_OVER = "passed over"
-    """Replaced by a newer reading (`queue = latest`)."""
+    """A newer reading replaced the reading (with `queue = latest`)."""
     UNPAIRED = "unpaired"
-    """No message arrived on another topic within the tolerance."""
+    """A message of one topic had no message of another topic within the tolerance."""
     TOO_LARGE = "too large"
-    """A message exceeded the limit of its topic (`topic_bytes`)."""
+    """A message was larger than the limit of its topic (`topic_bytes`)."""
     UNUSABLE = "with an unusable variable"
     FAILED = "failed on a board"
     WITH_APP = "lost with pcie-app"
@@ -48,9 +48,9 @@ class LossReason(StrEnum):
     NO_POSTERIOR = "no posterior"
     ROSBRIDGE_AWAY = "rosbridge away"
     REFUSED = "refused by rosbridge"
-    """The server does not pass the topic on: the topic has another type there, or is not allowed."""
+    """The server does not forward the topic. The topic has another type on the server, or is not allowed there."""
     SOME_TOPICS = "on some topics only"
-    """Published, but not on the topics of a disconnected server."""
+    """The result was published, but at least one server did not accept it or does not forward its topic."""
 
 
 class Outcome(StrEnum):
@@ -68,7 +68,7 @@ class FailureReason(StrEnum):
     FAILED = "failed"
     """A board failed while it computed the frame."""
     AWAY = "away"
-    """A board that failed an earlier frame is not back yet."""
+    """A board that failed an earlier frame is not available again yet."""
 
 
 # Arrays are shorter than maps and faster to decode. New fields go to the end, with a default.
@@ -80,7 +80,7 @@ class Record(msgspec.Struct, array_like=True, frozen=True):
 
 
 class Hello(Record, tag="hello", frozen=True):
-    """First record in each direction: the sender's role, version and deployment."""
+    """The first record in each direction. It names the sender's role, version and deployment."""
 
     role: str
     version: str
@@ -88,30 +88,30 @@ class Hello(Record, tag="hello", frozen=True):
 
 
 class Begin(Record, tag="begin", frozen=True):
-    """Master to a service: start of the run. With `once`, the run ends after its first frame."""
+    """The master tells a service that the run starts. With `once`, the run ends after the first frame."""
 
     once: bool
 
 
 class Ready(Record, tag="ready", frozen=True):
-    """A service to the master: the service is ready (connected, advertised, or boards programmed)."""
+    """A service tells the master that it has connected, advertised its topics, or programmed its boards."""
 
     sentence: str
 
 
 class Rosbridge(Record, tag="rosbridge", frozen=True):
-    """Subscriber or publisher to the master: whether it is connected to a rosbridge server now.
+    """The subscriber or publisher tells the master whether it is connected to a rosbridge server now.
 
-    When a service has reached a server again, the master tells the other service, which then reconnects at once.
+    If the subscriber or publisher is connected again, the master tells the other. The other then reconnects at once.
     """
 
     connected: bool
 
 
 class Notice(Record, tag="notice", frozen=True):
-    """A service to the master: a message for the user; the run continues.
+    """A service sends the master a message for the user. The run continues.
 
-    With `--log-level debug`, the master sends one per frame to the subscriber, with the number of the frame.
+    With `--log-level debug`, the master sends the subscriber a `Notice` with the number of each frame.
     """
 
     level: str
@@ -119,7 +119,7 @@ class Notice(Record, tag="notice", frozen=True):
 
 
 class Trouble(Record, tag="trouble", frozen=True):
-    """A service to the master: the reason why the service cannot continue."""
+    """A service tells the master why the service cannot continue."""
 
     exit_code: int
     sentence: str
@@ -142,7 +142,7 @@ None stands for a missing reading, and for a reading that is an array.
 
 
 class Reading(Record, tag="reading", frozen=True):
-    """Subscriber to master: one complete set of addresses.
+    """The subscriber sends the master one complete set of addresses.
 
     `stamp_ns` is the newest stamp of the messages in the set, or the time of receipt if they have no stamps.
     `prior_codes` is the prior from a message, with two bytes per cell of each replica. An empty `prior_codes` selects
@@ -165,14 +165,14 @@ class Reading(Record, tag="reading", frozen=True):
 
 
 class Unusable(Record, tag="unusable", frozen=True):
-    """Subscriber to master: an unusable message. `cause` is a key, the same for all messages with this kind of flaw."""
+    """The subscriber reports an unusable message to the master. Messages with equal flaws have the same `cause`."""
 
     cause: str
     sentence: str
 
 
 class FrameRequest(Record, tag="frame", frozen=True):
-    """Master to pcie-app: compute this frame. `number` increases from 1 for each master."""
+    """The master asks pcie-app to compute a frame. Every master numbers its frames from 1."""
 
     number: int
     addresses: Addresses
@@ -181,9 +181,9 @@ class FrameRequest(Record, tag="frame", frozen=True):
 
 
 class FrameResult(Record, tag="result", frozen=True):
-    """pcie-app to master: the results of the boards, durations, and the bytes and transfers on the links.
+    """pcie-app sends the master the boards' results, durations, and the bytes and transfers on the links.
 
-    `boards` is a list of `machines.kind.BoardResult`, not decoded, because a master without a filter only passes it on.
+    `boards` is an encoded list of `machines.kind.BoardResult`. A master without a filter forwards it without decoding.
     """
 
     number: int
@@ -197,7 +197,7 @@ class FrameResult(Record, tag="result", frozen=True):
 
 
 class FrameFailed(Record, tag="failed", frozen=True):
-    """pcie-app to master: a failed frame."""
+    """pcie-app reports a failed frame to the master."""
 
     number: int
     # The board that failed, and the exit code of a run that ends with this frame.
@@ -208,7 +208,7 @@ class FrameFailed(Record, tag="failed", frozen=True):
 
 
 class Publish(Record, tag="publish", frozen=True):
-    """Master to publisher: a result, with the data of its frame."""
+    """The master sends the publisher a result, with the data of its frame."""
 
     result: FrameResult
     # Times of its reading, for the report of the frame and its latency.
@@ -225,13 +225,13 @@ class Publish(Record, tag="publish", frozen=True):
 
 
 class Published(Record, tag="published", frozen=True):
-    """Publisher to master: the outcome of a result.
+    """The publisher tells the master the outcome of a result.
 
-    `seen` is whether the result came back from the server (None if that was not checked). `best_line` is the number of
-    the most probable cell. `total_ns` is the time from the reading's receipt to the result's sending. If there are
-    several outputs, `missed` counts those whose servers were not connected. `out_ns` is the duration of publishing.
-    `why` is the sentence of the frame's report, if there is no posterior or a biased one; `cause` lists the boards'
-    stop reasons.
+    `seen` is True if the result came back from the server, and None if that was not checked. `best_line` is the number
+    of the most probable cell. `total_ns` is the time from the reading's receipt to the result's sending. If the result
+    was published on some outputs only, `missed` is the number of the other outputs. `out_ns` is the duration of
+    publishing. If there is no posterior or a biased posterior, `why` is the sentence of the frame's report. `cause`
+    lists the boards' stop reasons.
     """
 
     number: int
@@ -248,9 +248,9 @@ class Published(Record, tag="published", frozen=True):
 
 
 class Seen(Record, tag="seen", frozen=True):
-    """Publisher to master, with `--loop`: whether the publisher received one of its own results back in time.
+    """With `--loop`, the publisher tells the master whether one of its own results came back in time.
 
-    If not, a second `Seen` follows as soon as a later result comes back.
+    If no result came back in time, a second `Seen` follows as soon as a later result comes back.
     """
 
     seen: bool

@@ -1,4 +1,4 @@
-"""The readings with which emulated boards are run: drawn from a model, or recorded."""
+"""Readings for runs of emulated boards. They are drawn from a model, or recorded."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ from toolchain.models.model import Known, Model, PriorSelect
 
 MISSING: Final = -1
 MOST_FRAMES: Final = 100_000
-"""Maximum number of frames, because all are kept in memory, each with a row of every column's table."""
+"""Maximum number of frames. Memory holds all frames, and for each frame a row of every column's table."""
 
 _WEIGHT_STEPS: Final = 500
 
@@ -49,7 +49,7 @@ class Readings:
         return len(self.addresses)
 
     def of_model(self, frame: int) -> tuple[tuple[int | NDArray[np.int64] | None, ...], int | None]:
-        """Return a frame in the form for `toolchain.models.model.exact_posterior`."""
+        """Return a frame's addresses and its row of the prior, for `toolchain.models.model.exact_posterior`."""
         row, addresses = int(self.prior_addresses[frame]), tuple(self.addresses[frame])
         if self.addresses.ndim == 2:
             addresses = tuple(None if at == MISSING else int(at) for at in addresses)
@@ -84,9 +84,10 @@ def check_frames(frames: int) -> None:
 def sample_readings(
     model: Model, frames: int, *, seed: int, source: str = "", in_sequence: bool = False
 ) -> Readings:
-    """Draw the line of each frame, then its readings; if a variable selects the prior, its values are equally probable.
+    """Draw the true line of each frame, and then the frame's readings given this line.
 
-    With `in_sequence`, the line of a frame is drawn from the transition out of the line before, if the model has one.
+    If a variable selects the prior, all values of the variable are equally probable. With `in_sequence`, the line of a
+    frame is drawn given the line of the previous frame, if the model has a transition.
     """
     check_frames(frames)
     random = np.random.default_rng(seed)
@@ -148,10 +149,10 @@ def readings_of_lines(
 def model_of_codes(
     name: str, searched: Sequence[Dimension], variables: Sequence[Variable], machine: BM1Machine
 ) -> Model:
-    """Return a model that quantises to the codes of a machine, for drawing readings without the original model.
+    """Reconstruct a model from the codes of a machine, for drawing readings without the original model.
 
-    Each row of a table was divided by its maximum before quantising. These maxima are estimated so that
-    the column of every line sums to 1 as nearly as possible (expectation maximisation).
+    Before quantising, each row of a table was divided by the row's maximum. Expectation maximisation estimates the
+    maxima of the rows, so that the column of every line sums to 1 as nearly as possible.
     """
     width = machine.parameters.prob_bits
     known = []

@@ -1,4 +1,4 @@
-"""The commands of analyses: `inspect` explains a deployment, `advise` and `explore` compare machines."""
+"""The analysis commands: `inspect` explains a deployment, and `advise` and `explore` compare machines."""
 
 import sys
 from collections.abc import Callable, Iterator
@@ -16,14 +16,14 @@ from toolchain.errors import BuildError, NotFusionError, counted
 from toolchain.flags import Bits
 
 RESULTS = Path("build/explore.jsonl")
-"""The default file of results. Version control ignores its folder, in which most deployments are built."""
+"""The default file of results. Version control ignores the folder `build`, and most deployments are built there."""
 
 
 @contextmanager
 def progress(total: int | None) -> Iterator[Callable[[str], None]]:
-    """Show a progress bar on a terminal, nothing elsewhere; yield a function to call with a text after each step.
+    """Show a progress bar if standard error is a terminal. Yield a function to call after each step.
 
-    Without a `total` number of steps, the bar shows movement, but no share.
+    The function takes a text to show beside the bar. If `total` is None, the bar does not show the share of done steps.
     """
     if not sys.stderr.isatty():
         yield lambda _: None
@@ -55,8 +55,8 @@ def inspect(
 ) -> None:
     """Explain a deployment: machine, quantisation loss, cycles, accuracy, resources and energy.
 
-    For example `toolchain inspect build/boat --model casestudies/boat --clock 100e6`, or over recorded readings
-    `toolchain inspect build/mrclam --readings DATA/ds1_robot3.csv --reading 'range_*=range_*_m' --reading
+    For example `toolchain inspect build/boat --model casestudies/boat --clock 100e6`. With recorded readings, for
+    example `toolchain inspect build/mrclam --readings DATA/ds1_robot3.csv --reading 'range_*=range_*_m' --reading
     'bearing_*=bearing_*_rad'`
     """
     from toolchain.analysis.inspection import as_json, inspect_deployment, inspection_report
@@ -85,7 +85,7 @@ def advise(
     options: AdviceOptions,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")] = False,
 ) -> None:
-    """Compare the machines for a model, at the same accuracy, with exact inference on this host, and recommend one.
+    """Compare a BM1, a BM2 and exact inference on this host for a model, at the same accuracy, and recommend one.
 
     For example `toolchain advise asia.bif --searched bronc --known smoke,dysp --accuracy 0.01`
     """
