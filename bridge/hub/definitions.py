@@ -1,8 +1,12 @@
 """Message definitions (the fields of each type) from `rosbags`, if it is installed.
 
-The hub forwards JSON without them. They are needed to fill absent fields, for CBOR with typed arrays, for serialised
-messages (cbor-raw) and for rosapi's descriptions of types. The first operation that needs `rosbags` imports it. Without
-`rosbags`, CBOR has typed arrays only for floats, and cbor-raw and descriptions of types are refused.
+The hub forwards JSON without definitions. It needs them for three purposes:
+
+- to fill absent fields,
+- to send CBOR with typed arrays (without `rosbags`, only arrays of floats are typed),
+- to serialise messages (`cbor-raw`) and describe types for rosapi (without `rosbags`, both are refused).
+
+The first operation that needs `rosbags` imports it.
 """
 
 import contextlib
@@ -40,10 +44,10 @@ _MISSING: Final = (
 
 
 class MessageDefinitions:
-    """The known message types of one ROS version."""
+    """The definitions of all known message types in one ROS version."""
 
     def __init__(self, ros_version: RosVersion = 1, wall_clock: Callable[[], int] = time.time_ns) -> None:
-        """Start without definitions; `wall_clock` returns nanoseconds since 1970, for absent stamps."""
+        """Start without definitions. `wall_clock` returns nanoseconds since 1970. This time fills absent stamps."""
         self.ros_version: RosVersion = ros_version
         # None before `load`, and also afterwards if rosbags is not installed.
         self._store: Typestore | None = None
@@ -66,11 +70,11 @@ class MessageDefinitions:
                 self._store = _store(Stores.ROS2_JAZZY if self.ros_version == 2 else Stores.ROS1_NOETIC)
 
     def name(self, type_name: str) -> str:
-        """Return a message type's name in the form of this ROS version."""
+        """Return the name of a message type in the form of `ros_version`."""
         return ros2_type(type_name) if self.ros_version == 2 else ros1_type(type_name)
 
     def filler(self, type_name: str) -> Filler | None:
-        """Return the filler of the absent fields of a message type, or None if the type is unknown."""
+        """Return the `Filler` that adds absent fields to messages of a type, or None if the type is unknown."""
         try:
             _store, known = self._known(type_name)
         except BridgeError:
@@ -78,7 +82,7 @@ class MessageDefinitions:
         return self._filler(known)
 
     def fillers(self, type_name: str, kind: Literal["srv", "action"]) -> dict[str, Filler]:
-        """Return the fillers of the parts of a service or an action, such as `Request`, as far as they are known."""
+        """Return a `Filler` for each known part of a service or action type, such as the part `Request`."""
         fillers = {part: self.filler(part_name(type_name, part, self.ros_version)) for part in PARTS[kind]}
         return {part: filler for part, filler in fillers.items() if filler is not None}
 
@@ -95,7 +99,7 @@ class MessageDefinitions:
         return self._fillers[name]
 
     def fields(self, name: str) -> Mapping[str, tuple[str, int]]:
-        """Return the element type and length of each field of a known message type, as from `element_of`."""
+        """Return the element type and length of each field of a known message type, in the form of `element_of`."""
         if name in TIMES:
             return dict.fromkeys(_TIME_FIELDS[self.ros_version], ("uint32", -1))
         store, known = self._known(name)
@@ -140,7 +144,7 @@ class MessageDefinitions:
         }
 
     def encode(self, type_name: str, message: dict[str, Any]) -> bytes | None:
-        """Return a message as CBOR with typed arrays, or None if its type is unknown or the message does not fit it."""
+        """Return a message as CBOR with typed arrays, or None if the type is unknown or the message does not fit."""
         try:
             if type_name not in self._encoders:
                 store, known = self._known(type_name)
@@ -178,7 +182,7 @@ class MessageDefinitions:
         return text
 
     def details(self, type_name: str) -> list[dict[str, Any]]:
-        """Return the fields of a type and nested types as `rosapi_msgs/TypeDef`, or raise a RefusedOperationError."""
+        """Describe a type and its nested types as `rosapi_msgs/TypeDef`, or raise a RefusedOperationError."""
         store, known = self._known(type_name)
         found: dict[str, dict[str, Any]] = {}
         waiting = [known]

@@ -17,10 +17,10 @@ from bridge.hub.outbox import Lane, Outbox
 
 @dataclass(eq=False, slots=True)
 class Client:
-    """One connected client. The key of a call or a goal is the id that the hub gives it."""
+    """A connected client. The key of a call or a goal is an id that the hub assigns."""
 
     number: int
-    """1, 2, ... in the order of connection."""
+    """The number of the client: 1, 2, ... in the order of connection."""
     address: str
     """Network address, for the log and `service_host`."""
     outbox: Outbox
@@ -29,59 +29,59 @@ class Client:
     subscriptions: dict[str, "TopicSubscription"] = field(default_factory=dict)
     """The client's subscriptions, by the topic's absolute name."""
     open_advertisements: int = 0
-    """Number of advertise operations in force, over all topics."""
+    """Number of the client's advertise operations, over all topics, that have not been withdrawn."""
     open_subscriptions: int = 0
-    """Number of subscribe operations in force, over all topics."""
+    """Number of the client's subscribe operations, over all topics, that have not been withdrawn."""
     services: set[str] = field(default_factory=set)
     """Absolute names of the services that the client offers."""
     calls: set[str] = field(default_factory=set)
-    """Keys of the calls that the client made and that are not answered yet."""
+    """Keys of the client's own calls that have no answer yet."""
     requests: set[str] = field(default_factory=set)
     """Keys of the calls that the client must answer."""
     actions: set[str] = field(default_factory=set)
     """Absolute names of the actions that the client offers."""
     goals: dict[OperationId, str] = field(default_factory=dict)
-    """Keys of the goals that the client sent and that have not ended, by the ids in its messages."""
+    """Keys of the unfinished goals that the client sent, by the id that the client gave to the goal."""
     tasks: set[str] = field(default_factory=set)
     """Keys of the goals that the client executes."""
     refused: int = 0
     """Number of the client's operations that were refused."""
     takeovers: int = 0
-    """Number of offers of services and actions with which the client replaced those of other clients."""
+    """How often the client took over a service or an action that another client offered."""
     fragments: Reassembler | None = None
-    """The client's incomplete messages, once it has sent a fragment."""
+    """The `Reassembler` of the client's fragments, or None until the client sends a fragment."""
     wants_status: bool = False
-    """True if the client requested status messages about refusals."""
+    """True if the client requested a status message about each refused operation."""
     status_lane: Lane | None = None
-    """The queue of the status messages for the client; created with the first message."""
+    """The queue of status messages to the client, or None before the first status message."""
     last_published: "Advertisement | None" = None
-    """The advertisement that `envelopes` gave for the client's last message; tried first for the next message."""
+    """The advertisement of the client's last message with a known envelope. The hub tries it first the next time."""
     envelopes: dict[bytes, "Advertisement"] = field(default_factory=dict)
-    """The client's advertisements, by the bytes before the message in its publish operations (their envelope)."""
+    """The client's advertisements by envelope: the bytes of a publish operation before the message."""
     close_reason: str = ""
-    """Reason why the client must be disconnected, or empty."""
+    """Reason why the hub must disconnect the client, or empty."""
     is_ready: bool = False
     """True while the client is in the dispatcher's list of clients with output."""
 
     @property
     def node(self) -> str:
-        """Return the client's name as a ROS node."""
+        """The client's name as a ROS node."""
         return f"/client_{self.number}"
 
 
 @dataclass(eq=False, slots=True)
 class Advertisement:
-    """A client's publication on one topic, combined from all its advertise operations."""
+    """A client's publication on one topic. It combines all advertise operations of the client for the topic."""
 
     client: Client
     topic: "Topic"
     filler: Filler | None
-    """Fills the absent fields of its messages, if their type is known."""
+    """The `Filler` of absent fields in the messages, or None if the type of the messages is unknown."""
     latching: bool = False
     ids: set[OperationId] = field(default_factory=set)
-    """Ids of the advertise operations that have not been withdrawn."""
+    """Ids of the advertise operations that the client has not withdrawn."""
     envelope: bytes = b""
-    """The bytes before the message in a publish operation, once they are known."""
+    """The bytes before the message in a publish operation, or empty until they are known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,25 +93,25 @@ class SubscribeOptions:
     queue_length: int
     compression: Encoding = Encoding.NONE
     fragment_size: int = 0
-    """Maximum bytes of a message in one fragment, 0 for whole messages."""
+    """Maximum number of bytes of a message per fragment, or 0 for whole messages."""
 
 
 @dataclass(eq=False, slots=True)
 class TopicSubscription:
-    """A client's subscription to one topic, combined from all its subscribe operations."""
+    """A client's subscription to one topic. It combines all subscribe operations of the client for the topic."""
 
     client: Client
     topic: "Topic"
     prefix: bytes
-    """The bytes before each of its messages as JSON, with the topic's name as the client uses it."""
+    """The bytes before each message in the JSON that the client receives. They contain `name`."""
     name: str
-    """The topic's name as the client uses it."""
+    """The topic's name as the client writes it, with or without the leading slash."""
     lane: Lane = field(default_factory=Lane)
     compression: Encoding = Encoding.NONE
     typed: bool = False
-    """True if the client named a type, which becomes the type of the topic."""
+    """True if the client named the topic's type."""
     options: dict[OperationId, SubscribeOptions] = field(default_factory=dict)
-    """Options of each subscribe operation; the smallest throttle, queue length and fragment size apply."""
+    """Options of each subscribe operation, by its id. The smallest throttle, queue length and fragment size apply."""
 
 
 @dataclass(eq=False, slots=True)
@@ -129,7 +129,7 @@ class Topic:
     latching: bool = False
     """True while one of its publishers latches."""
     latched: bytes | None = None
-    """The last message as JSON, while a publisher latches."""
+    """The last message as JSON, or None if the topic has no latching publisher."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,12 +158,12 @@ class Graph:
         """Bytes of all latched messages."""
 
     def latch(self, topic: Topic, message: bytes | None) -> None:
-        """Replace a topic's latched message; None removes it."""
+        """Replace a topic's latched message, or remove it if `message` is None."""
         self.latched_bytes += len(message or b"") - len(topic.latched or b"")
         topic.latched = message
 
     def tidy(self, topic: Topic) -> None:
-        """Drop the latched message, the type and the topic itself once no client needs them."""
+        """Drop a topic's latched message, its type or the topic itself if no client needs it any more."""
         topic.latching = any(advertisement.latching for advertisement in topic.advertisements.values())
         if not topic.latching:
             self.latch(topic, None)

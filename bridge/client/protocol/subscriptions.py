@@ -1,6 +1,6 @@
-"""Subscriptions of a client; all subscriptions to a topic share one `subscribe` operation on the wire.
+"""The subscriptions of a client. All subscriptions to a topic share one `subscribe` operation.
 
-Some servers deliver a first message twice, or not at all, to a client that subscribes twice.
+If a client subscribes twice, some servers deliver the first message twice or not at all.
 """
 
 import sys
@@ -128,8 +128,9 @@ _UNKNOWN: Final = _Known(b"\xff", 0, "", _Subscribed("", None, _DEFAULT, "", sys
 class Subscriptions:
     """All subscriptions of a client.
 
-    Receiving messages is the client's busiest path: `receive_known` handles messages whose envelope is known from an
-    earlier message, and `receive` all others, after parsing. What both need is computed when subscriptions change.
+    Receiving messages is the client's busiest path. An envelope is the bytes of an operation before the message. If the
+    envelope is known from an earlier message, `receive_known` handles the message. `receive` handles all other
+    messages, after parsing.
     """
 
     def __init__(self, wire: Wire) -> None:
@@ -159,7 +160,7 @@ class Subscriptions:
             self._send_subscribe(subscribed)
 
     def subscribe(self, topic: str, type_name: str | None = None, delivery: Delivery = _DEFAULT) -> int:
-        """Subscribe to a topic (see `bridge.client.Ros.subscribe`), and return the subscription's number."""
+        """Subscribe to a topic as in `bridge.client.Ros.subscribe`, and return the number of the subscription."""
         check_name(topic)
         if type_name is not None:
             split_type(type_name)
@@ -209,13 +210,14 @@ class Subscriptions:
         return subscribed.numbers
 
     def has_left_out(self, topic: str) -> bool:
-        """Return whether a topic is left out, because its messages are too large for the connection."""
+        """Return whether the client stopped subscribing to a topic because its messages are too large for the
+        connection."""
         subscribed = self._subscribed.get(absolute(topic))
         return subscribed is not None and subscribed.left_out
 
     @property
     def largest(self) -> tuple[str, int]:
-        """The topic with the largest message so far, and that message's size in bytes (0 before the first message)."""
+        """The topic of the largest message so far, and that message's size in bytes: 0 before the first message."""
         known = [(subscribed.topic, subscribed.largest) for subscribed in self._subscribed.values()]
         return max(known, key=itemgetter(1), default=("", 0))
 
@@ -242,7 +244,7 @@ class Subscriptions:
         self.numpy = any(delivery.arrays == "numpy" for delivery in deliveries)
 
     def unsubscribe(self, subscription: int) -> None:
-        """End a subscription; after the last one of a topic, unsubscribe from the server."""
+        """End a subscription. If it is the last subscription to its topic, unsubscribe at the server."""
         subscribed = self._subscriptions.pop(subscription)
         subscribed.numbers = tuple(each for each in subscribed.numbers if each != subscription)
         self.forget_envelopes()
@@ -270,7 +272,7 @@ class Subscriptions:
         return bool(waiting)
 
     def silent(self) -> list[str]:
-        """Return the topics that were subscribed to with a type and have had no message on this connection."""
+        """Return the topics without a message on this connection, out of the topics subscribed to with a type."""
         return [
             s.topic
             for s in self._subscribed.values()
@@ -278,11 +280,11 @@ class Subscriptions:
         ]
 
     def renew(self, topic: str) -> bool:
-        """Subscribe again to a topic that is published but silent; return True if this changes the encoding to JSON.
+        """Subscribe again to a topic that is published but silent. Return True if the encoding changes to JSON.
 
-        rosbridge for ROS 2 fixes the quality of service when it subscribes, so it gets nothing from a best-effort
-        publisher that starts later. Servers fail to write some types as CBOR, so the second and later renewals request
-        JSON.
+        rosbridge for ROS 2 fixes the quality of service when it subscribes. It then gets nothing from a best-effort
+        publisher that starts later. Servers also fail to write some types as CBOR. The second and later renewals
+        therefore request JSON.
         """
         subscribed = self._subscribed.get(absolute(topic))
         if subscribed is None or subscribed.has_messages:
@@ -300,10 +302,10 @@ class Subscriptions:
     def receive_known(
         self, messages: Sequence[bytes], first: int, received_ns: int, monotonic_ns: int
     ) -> tuple[list[Message], tuple[int, ...]]:
-        """Decode the messages from index `first` on that have the known envelope; return them, and their subscriptions.
+        """Decode messages from index `first` on that have one known envelope. Return them with subscription numbers.
 
-        Decoding stops at the first message with another envelope. If that is already the message at `first`, nothing
-        is returned, and `ClientCore.receive` must handle it.
+        Decoding stops at a message that has another envelope, is too large or is invalid. If no message is returned,
+        `ClientCore.receive` must handle the message at `first`.
         """
         envelope, size, topic, subscribed = self._known
         depth = self._wire.max_depth - 1  # of a message inside its operation
@@ -337,7 +339,7 @@ class Subscriptions:
         return received, subscribed.numbers
 
     def discard_known(self, data: bytes) -> MessageDiscarded | None:
-        """Discard a message with a known envelope without parsing it, if it is above its topic's limit."""
+        """Discard an unparsed message with a known envelope if it exceeds its topic's limit. Otherwise return None."""
         known = self.envelopes.get(envelope_of(data))
         is_usable = len(data) <= self._wire.max_size
         return known.subscribed.measure(known.topic, len(data)) if known is not None and is_usable else None
