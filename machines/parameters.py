@@ -1,4 +1,4 @@
-"""The parameters of a BM1 (thesis 2.1.2), and the enumerations and checks that it shares with the BM2."""
+"""The parameters of a BM1 (thesis 2.1.2), and enumerations and checks for both the BM1 and the BM2."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -7,25 +7,25 @@ from typing import ClassVar, Final
 from machines.errors import MachineError, ParameterError
 
 PROB_BITS_MAX: Final = 16
-"""Maximum width of a code in bits, because tables contain uint16."""
+"""Maximum number of bits in a code. Tables store codes as uint16."""
 
 ADDRESS_BITS_MAX: Final = 16
-"""Maximum width of an address of a sensor or prior table in bits: 65,536 rows of one code per line."""
+"""Maximum number of address bits of a sensor or prior table: 65,536 rows. A row has one code per line."""
 
 COUNTER_BITS_MAX: Final = 32
-"""Maximum width of a counter in bits: the width of a result register."""
+"""Maximum number of bits in a counter: the width of a result register."""
 
 STEPS_PER_CLOCK_MAX: Final = 256
-"""Maximum number of steps per clock: hardware unrolls them, and the reference kernel executes them one by one."""
+"""Maximum number of steps per clock. Hardware unrolls the steps, and the reference kernel makes them one by one."""
 
 RNG_BANKS_MAX: Final = 65536
 """Maximum number of seed sets."""
 
 REPLICAS_MAX: Final = 256
-"""Maximum number of machines on a board: the register map has room for the outcomes of this many."""
+"""Maximum number of replicas on a board. The register map has room for the outcomes of 256 replicas."""
 
 CYCLES_MAX: Final = 2**63 - 1
-"""Maximum of `max_cycles` and `run_until`: their registers have 64 bits, and their values must fit into an int64."""
+"""Maximum of `max_cycles` and `run_until`. Their registers have 64 bits, but the values must fit into an int64."""
 
 
 class RngKind(StrEnum):
@@ -40,7 +40,7 @@ class RngKind(StrEnum):
 
     @property
     def lfsr_bits(self) -> int | None:
-        """Width of the LFSR's state in bits; None for other kinds."""
+        """Width of an LFSR's state in bits, or None if the generator is no LFSR."""
         return _LFSR_BITS.get(self)
 
 
@@ -48,21 +48,21 @@ _LFSR_BITS: Final = {RngKind.LFSR8: 8, RngKind.LFSR16: 16, RngKind.LFSR24: 24, R
 
 
 class RngReset(StrEnum):
-    """Start of a frame's random numbers: the seeds of its bank, or (`free`) where the previous frame ended."""
+    """Where the generators begin a frame: at the seeds of a bank (`bank`), or where the last frame ended (`free`)."""
 
     BANK = "bank"
     FREE = "free"
 
 
 class PriorMode(StrEnum):
-    """Source of the prior's codes: a row of a table, or codes that the host writes, one per line."""
+    """Source of the prior's codes: a row of a table (`table`), or the host (`written`), with one code per line."""
 
     TABLE = "table"
     WRITTEN = "written"
 
 
 class SensorMode(StrEnum):
-    """Inputs of a sensor column (thesis 4.4): one address, an address for each cell, or a code for each cell."""
+    """Input of a sensor column (thesis 4.4): an address, an address per cell, or (`threshold`) a code per cell."""
 
     COLUMN = "column"
     CELL = "cell"
@@ -70,7 +70,7 @@ class SensorMode(StrEnum):
 
 
 class Sequencer(StrEnum):
-    """Orders in which a BM2 draws the unknown bits: rising, random, or one bit of each variable of a colour at once."""
+    """Order in which a BM2 draws unknown bits. `coloured` draws one bit of each variable of one colour at once."""
 
     LINEAR = "linear"
     RANDOM = "random"
@@ -78,7 +78,7 @@ class Sequencer(StrEnum):
 
 
 class SampleEvery(StrEnum):
-    """Moves of a BM2 after which the state becomes a sample: the last move of each sweep, or every move."""
+    """Whether a BM2 takes a sample after each sweep or after each move."""
 
     SWEEP = "sweep"
     MOVE = "move"
@@ -173,7 +173,7 @@ class BM1Parameters:
 
     @property
     def columns(self) -> int:
-        """Number of columns, including the prior (N + 1)."""
+        """Number of columns: the prior's column and N sensor columns."""
         return len(self.sensor_bits) + 1
 
     @property
@@ -183,7 +183,7 @@ class BM1Parameters:
 
     @property
     def has_tables(self) -> bool:
-        """True if sensor columns have tables; in `threshold` mode their inputs are codes."""
+        """True if sensor columns have tables. In `threshold` mode, they have none, because their inputs are codes."""
         return self.sensor_mode is not SensorMode.THRESHOLD
 
     @property
@@ -207,7 +207,7 @@ class BM1Parameters:
 
     @property
     def ones_code(self) -> int:
-        """The code whose bits are all 1: a cell with this code makes a 1 in every cycle."""
+        """The code with all bits 1. A cell with this code makes a 1 in every cycle."""
         return (1 << self.prob_bits) - 1
 
     @property
@@ -216,14 +216,14 @@ class BM1Parameters:
         return (1 << self.counter_bits) - 1
 
     def missing_address(self, column: int) -> int:
-        """Return the address of a missing reading in sensor column `column` (1..N), or raise a ParameterError."""
+        """Return the address that means a missing reading in column `column` (1..N), or raise a ParameterError."""
         if not 1 <= column <= self.sensors:
             raise ParameterError(f"There is no sensor column {column}: this machine has 1 to {self.sensors}.")
         return (1 << self.sensor_bits[column - 1]) - 1
 
 
 def set_choices(parameters: object, **kinds: type[StrEnum]) -> None:
-    """Convert each parameter that is a keyword in `kinds` to its enumeration, in place, or raise a ParameterError."""
+    """Convert each attribute named in `kinds` to its enumeration, in place, or raise a ParameterError."""
     for name, kind in kinds.items():
         given = getattr(parameters, name)
         try:
@@ -235,7 +235,7 @@ def set_choices(parameters: object, **kinds: type[StrEnum]) -> None:
 def check_parameter(
     name: str, value: object, lowest: int, highest: int, error: type[MachineError] = ParameterError
 ) -> None:
-    """Refuse a value that is not an integer from `lowest` to `highest`."""
+    """Raise `error` unless `value` is an integer from `lowest` to `highest`."""
     if not isinstance(value, int) or isinstance(value, bool):
         raise error(f"{name} is {value!r}; it must be an integer.")
     if not lowest <= value <= highest:

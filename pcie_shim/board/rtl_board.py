@@ -1,4 +1,4 @@
-"""The board whose hardware is simulated: accesses to its registers become AXI4-Lite transactions of the VHDL."""
+"""A board with simulated hardware. An access to a register becomes an AXI4-Lite transaction of the VHDL."""
 
 import struct
 import threading
@@ -15,7 +15,7 @@ from pcie_shim.register_layout import ALL_ONES, DONE_BLOCK, SETTINGS, WORD, fiel
 from pcie_shim.register_map import BoardState, ErrorCode
 
 LOAD_S: Final = 20.0
-"""Seconds for which programming waits for a compilation; after that, the loader has to try again."""
+"""Maximum seconds that `load` waits for a compilation. Then `load` refuses, and the loader has to try again."""
 
 _SHORTEST_CHUNK: Final = 16  # clocks
 _DOORBELLS: Final = (rm.START, rm.RESUME)
@@ -31,12 +31,12 @@ _DETAILS: Final = {
 class RtlBoard:
     """A board like `EmulatedBoard`, but its registers and its machine are simulated hardware.
 
-    While it is blank, there is no hardware, and an emulated blank board answers. If the simulation ends,
-    hangs or answers garbage, a SimulationError is raised, and the board is unusable from then on.
+    While the board is blank, no hardware is simulated, and a blank `EmulatedBoard` answers. If the simulation ends,
+    hangs or sends an invalid answer, the board raises a SimulationError and is unusable from then on.
     """
 
     def __init__(self, simulate: Callable[[Image], Simulation]) -> None:
-        """Create a blank board; `simulate` compiles and starts an image's hardware, or raises a SimulationError."""
+        """Create a blank board. `simulate` compiles and starts an image's hardware, or raises a SimulationError."""
         self._simulate = simulate
 
         # While there is no simulation, this board answers.
@@ -67,7 +67,7 @@ class RtlBoard:
 
     @property
     def image_hash(self) -> str:
-        """SHA-256 (hex) of the loaded image; zeros while blank."""
+        """SHA-256 of the loaded image in hexadecimal, or zeros while the board is blank."""
         return self._image_hash
 
     @property
@@ -78,7 +78,7 @@ class RtlBoard:
     # ---- programming ----------------------------------------------------------------------------------
 
     def prepare(self, image: Image) -> None:
-        """Compile and start the hardware of an image that will be loaded, or raise a SimulationError."""
+        """Compile and start the hardware of an image before `load`. Raise a SimulationError if this fails."""
         if self._preparation is not None:
             self._preparation.close()
         self._preparation = _Preparation(self._simulate, image)
@@ -87,7 +87,7 @@ class RtlBoard:
             raise self._preparation.error
 
     def load(self, content: bytes) -> None:
-        """Program the board as `Board.load` does; also raise a RefusedError if compiling takes longer than LOAD_S."""
+        """Program the board as `Board.load` does. A compilation longer than LOAD_S also raises a RefusedError."""
         if self.running:
             raise RefusedError(ErrorCode.BUSY, "the machine is running; reset it before programming")
         try:
@@ -128,7 +128,7 @@ class RtlBoard:
     # ---- registers ------------------------------------------------------------------------------------
 
     def read(self, address: int, count: int) -> bytes:
-        """Return `count` words from `address` on; a RefusedError if a word is not in the map, or not implemented."""
+        """Return `count` words from `address` on, or raise a RefusedError if the board lacks one of the words."""
         simulation = self._simulation
         if simulation is None:
             return self._blank.read(address, count)
@@ -149,7 +149,7 @@ class RtlBoard:
         return bytes(words)
 
     def write(self, address: int, words: bytes | memoryview) -> None:
-        """Write words from `address` on, as `Board.write`; if a word is refused, earlier ones may have been written."""
+        """Write words from `address` on (see `Board.write`). Words before a refused word may have been written."""
         simulation = self._simulation
         if simulation is None:
             self._blank.write(address, words)
@@ -212,11 +212,11 @@ class RtlBoard:
         self.running = field_of(rm.STATUS_STATE_MASK, status) == BoardState.RUNNING
 
     def interrupt_words(self) -> bytes:
-        """Return an interrupt's payload, the registers from DONE to COMPUTE_NS; the host reads the results itself."""
+        """Return the payload of an interrupt: the registers from DONE to COMPUTE_NS. The results are not included."""
         return self.read(rm.DONE, DONE_BLOCK.size // 4)
 
     def release(self) -> None:
-        """Stop a running machine and disable interrupts, because the host has disconnected."""
+        """Stop a running machine and disable interrupts. The server calls this after the host has disconnected."""
         if self._simulation is None:
             self._blank.release()
             return
