@@ -1,4 +1,4 @@
-"""The options of a build: everything that determines a deployment except the model (thesis 3.2, 3.4)."""
+"""The options of a build. A model and these options determine the whole deployment (thesis 3.2, 3.4)."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ TARGET_COUNT: Final = typer.Option(
 
 @dataclass(frozen=True, kw_only=True)
 class TargetOptions:
-    """The flags of a build that say where readings come from and posteriors go to."""
+    """The flags of a build about the source of the readings and the destination of the posteriors."""
 
     uri: Annotated[str, URI] = ""
     topic: Annotated[str, TOPIC] = ""
@@ -65,7 +65,7 @@ class TargetOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class DeploymentEdits:
-    """Changes of `deployment.toml`, as flags of `toolchain regenerate deployment`; None leaves a key unchanged."""
+    """The flags of `toolchain regenerate deployment`, which edit `deployment.toml`. None leaves a key unchanged."""
 
     uri: Annotated[str | None, URI] = None
     topic: Annotated[str | None, TOPIC] = None
@@ -91,7 +91,7 @@ THESIS: Final = {
     # `toolchain explore` has a list of steps
     "steps": "1",
 }
-"""The values that `--thesis` gives to other flags, for the machine of the thesis; a command may lack some flags."""
+"""The defaults that `--thesis` gives to other flags, for the machine of the thesis. A command may lack some flags."""
 
 
 def _use_thesis(context: typer.Context, value: bool) -> bool:
@@ -114,17 +114,17 @@ Thesis: TypeAlias = Annotated[
 
 
 class MachineChoice(StrEnum):
-    """The values of `--machine`, the kind of machine to build for a model."""
+    """The values of `--machine`: the kind of machine to build for a model."""
 
     AUTO = "auto"
-    """A BM1 if the question is a naive fusion, otherwise a BM2."""
+    """A BM1 if the known variables are independent given the searched variables, otherwise a BM2."""
     BM1 = "bm1"
     BM2 = "bm2"
 
 
 @dataclass(frozen=True, kw_only=True)
 class CommonOptions:
-    """The flags of a build that both kinds of machine have; None stands for the default of the kind that is built."""
+    """The flags of a build that both kinds of machine have. None stands for the default of the chosen kind."""
 
     machine: Annotated[
         MachineChoice,
@@ -159,7 +159,7 @@ class CommonOptions:
 
 
 FILL: Final = 0
-"""The value of `--replicas fill`: as many replicas on a board as its FPGA has room for."""
+"""The number that `--replicas fill` means: a board gets as many replicas as fit its FPGA."""
 
 
 def replica_count(text: str) -> int:
@@ -176,7 +176,7 @@ def replica_count(text: str) -> int:
 
 @dataclass(frozen=True, kw_only=True)
 class BM1Options:
-    """The flags of a build that only a BM1 has, except those that name a file or need parsing."""
+    """The flags of a build that only a BM1 has. Flags that name a file or need parsing are not included."""
 
     scale: Annotated[
         Scale | None,
@@ -215,7 +215,7 @@ class BM1Options:
 
 @dataclass(frozen=True, kw_only=True)
 class BM2Options:
-    """The flags of a build that only a BM2 uses."""
+    """The flags of a build that only a BM2 has."""
 
     sequencer: Annotated[Sequencer, typer.Option(help="Order in which a BM2 samples the bits.")] = (
         Sequencer.LINEAR
@@ -237,7 +237,7 @@ class BM2Options:
 
 
 def given_flags(options: CommonOptions, group: type[BM1Options | BM2Options]) -> list[str]:
-    """Return the flags of a group whose values came from the user: neither defaults nor set by `--thesis`."""
+    """Return the flags in `group` with a value that is neither the default nor the value that `--thesis` sets."""
     preset = THESIS if options.thesis else {}
     return [
         _flag(each.name)
@@ -248,27 +248,27 @@ def given_flags(options: CommonOptions, group: type[BM1Options | BM2Options]) ->
 
 @dataclass(frozen=True, kw_only=True)
 class MachineOptions(BM2Options, BM1Options, CommonOptions):
-    """The flags of a build about the machine, except those that name a file or need parsing."""
+    """All flags of a build about the machine. Flags that name a file or need parsing are not included."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class BuildOptions(MachineOptions, TargetOptions):
-    """The options of a build: the values of its flags, and the contents of files that flags name."""
+    """The options of a build: the values of its flags, and the contents of the files that flags name."""
 
     # defaults for a machine that no robot uses, such as one that is only checked or analysed
     uri: str = "ws://127.0.0.1:9090"
     topic: str = "/readings"
     type: str = "std_msgs/Float64MultiArray"
     interface: tuple[int, int] | None = None
-    """Numbers of input and result words of a board's registers; None for as many as the largest board needs."""
+    """Numbers of input words and result words of a board's registers. None selects what the largest board needs."""
     rng_table: NDArray[np.uint32] | None = None
-    """uint32[length], the random numbers for `rng = table`; None to generate them."""
+    """The random numbers for `rng = table`: uint32[length]. If None, the build generates random numbers."""
     sources: SourcesFile | None = None
-    """The content of the file of `--sources`, or None. The file replaces `uri`, `topic` and `type`."""
+    """The content of the file given by `--sources`, or None. The file replaces `uri`, `topic` and `type`."""
     model_flags: ModelSection = field(default_factory=ModelSection)
-    """The flags with which the model was read, for `[model]` of the deployment."""
+    """The flags with which the model was read. They become the section `[model]` of the deployment."""
     build_date: str = ""
-    """The date of the build, ISO 8601: part of the images' manifests, but not of their hashes."""
+    """The date of the build in ISO 8601, for the manifests of images. It does not influence the images' hashes."""
 
     def __post_init__(self) -> None:
         """Refuse a malformed server, topic, type or path before a model is read."""
@@ -279,14 +279,14 @@ class BuildOptions(MachineOptions, TargetOptions):
 
     @property
     def scaling(self) -> Scale:
-        """The part of a table that is divided by its own maximum: `scale`, or the default if `scale` is None."""
+        """The part of a table that is divided by its maximum: `scale` or, if `scale` is None, the default."""
         if self.scale is not None:
             return self.scale
         return Scale.ADDRESS if self.sensor_mode is SensorMode.COLUMN else Scale.COLUMN
 
     @property
     def all_sources(self) -> tuple[Source, ...]:
-        """The sources of readings, as in a deployment."""
+        """The sources of readings: those of the sources file, or one made from `uri`, `topic` and `type`."""
         if self.sources is not None:
             return self.sources.sources
         return (Source(uri=self.uri, topic=self.topic, type=self.type),)
@@ -300,7 +300,7 @@ class BuildOptions(MachineOptions, TargetOptions):
 
 
 def refused_parameter(reason: ParameterError) -> BuildError:
-    """Return an error for parameters that no machine can have, with the flags in place of the parameters' names."""
+    """Convert an error about parameters to a BuildError that names flags instead of parameters."""
     keys = "|".join(each.name for each in fields(MachineOptions))
     named = re.sub(rf"\b({keys})(?= is | = )", lambda found: _flag(found[1]), str(reason).rstrip("."))
     return BuildError(named.replace(" = true", "").replace(" = ", " "))
@@ -311,7 +311,7 @@ def _flag(key: str) -> str:
 
 
 def refused_option(reason: ValidationError) -> BuildError:
-    """Return the error for an option that pydantic refuses, with the flag in place of the field's name."""
+    """Convert pydantic's error about an option to a BuildError that names the flag instead of the field."""
     detail = reason.errors(include_url=False)[0]
     key = str(detail["loc"][0]) if detail["loc"] else ""
     flag = {

@@ -1,4 +1,4 @@
-"""The commands about a network file: `query` prints posteriors, `show` lists the variables that can be asked about."""
+"""The commands for a network file: `query` prints posteriors, and `show` lists the variables."""
 
 import re
 import sys
@@ -35,7 +35,7 @@ def query(
     ] = False,
     json: Json = False,
 ) -> None:
-    """Print the posterior of variables of a network: the exact one and, with --machine, what a machine says.
+    """Print the exact posterior of variables of a network and, with --machine, also the posterior of a machine.
 
     For example `toolchain query asia.bif --searched bronc --known smoke=yes --known dysp=yes --machine auto`
     """
@@ -64,7 +64,7 @@ def show(
     ] = "",
     json: Json = False,
 ) -> None:
-    """List the variables of a network and their states, and which variables may be known together.
+    """List the variables and states of a network and, with --searched, the variables that a BM1 can know together.
 
     For example `toolchain show asia.bif --searched bronc`
     """

@@ -1,4 +1,4 @@
-"""The deployment: everything that follows from the model and that the services need."""
+"""The deployment: the data that a build computes from a model and that the services need."""
 
 from toolchain.deployment.deployment import (
     FILE_NAME,

@@ -1,10 +1,10 @@
-"""The filter of a deployment, which makes the posterior of a frame the prior of the next one.
+"""The filter of a deployment: it predicts the prior of a frame from the posterior of the frame before.
 
     start ─▶ belief ──predict──▶ prediction ──codes──▶ written prior of the boards ──▶ posterior
                 ▲                                                                          │
                 └───────────────────────────────── update ─────────────────────────────────┘
 
-A frame without a posterior leaves the prediction as the belief.
+If a frame has no posterior, the prediction becomes the belief.
 """
 
 import hashlib
@@ -37,7 +37,7 @@ class Transition:
     start: NDArray[np.float64]
     """P(S) before the first frame, float64[lines]."""
     table: NDArray[np.float64]
-    """P(S | S one frame earlier), float64[lines, lines]; a row for each value of the earlier S."""
+    """P(S | S one frame earlier), float64[lines, lines]. Each row belongs to one value of the earlier S."""
 
     def __post_init__(self) -> None:
         lines = np.shape(self.start)
@@ -55,14 +55,14 @@ class Transition:
             object.__setattr__(self, name, own)
 
     def after(self, belief: NDArray[np.float64], steps: int = 1) -> NDArray[np.float64]:
-        """Return the distribution `steps` frames after the belief, if there is no reading meanwhile: float64[lines]."""
+        """Return P(S) `steps` frames after `belief`, if no readings arrive in between: float64[lines]."""
         for _ in range(steps):
             belief = belief @ self.table
         later: NDArray[np.float64] = belief / belief.sum()
         return later
 
     def content(self) -> bytes:
-        """Return the content of the file: a NumPy array of float64[1 + lines, lines], the start and then the table."""
+        """Return the bytes of the filter's .npy file: float64[1 + lines, lines], `start` above the rows of `table`."""
         return (
             _header((len(self.table) + 1, len(self.table)))
             + np.vstack([self.start, self.table]).astype("<f8").tobytes()
@@ -70,7 +70,7 @@ class Transition:
 
     @classmethod
     def read(cls, path: Path, lines: int, sha256: str) -> "Transition":
-        """Read the start and transition in the file of a filter, or raise a DeploymentError."""
+        """Read the file of a filter. Raise a DeploymentError if the file is missing, damaged or of another build."""
         if not path.is_file():
             raise DamagedDeploymentError(
                 f"{path}, the filter's start and transition, does not exist: build it again with 'toolchain build'"
@@ -116,10 +116,10 @@ def prediction_codes(prediction: NDArray[np.float64], prob_bits: int) -> NDArray
 
 
 class Filter:
-    """The belief about the searched variable, from frame to frame."""
+    """A running filter. It keeps the belief about the searched variable from frame to frame."""
 
     def __init__(self, transition: Transition, prob_bits: int) -> None:
-        """Begin with the start distribution; `prob_bits` is the width of the codes."""
+        """Begin with the start distribution of `transition`. `prob_bits` is the width of the codes."""
         self.transition: Final = transition
         self._prob_bits = prob_bits
         self.most_steps: Final = max(1, _MOST_WORK // transition.table.size)
@@ -128,11 +128,14 @@ class Filter:
         """P(S | all readings so far), float64[lines]; after `predict`, P(S) of the next frame before its readings."""
 
     def predict(self, steps: int = 1) -> NDArray[np.uint16]:
-        """Move the belief `steps` frames on, and return the codes of the prior of the frame reached: uint16[lines]."""
+        """Advance the belief by `steps` frames, and return it as the codes of a prior: uint16[lines].
+
+        One call advances the belief by at most `most_steps` frames.
+        """
         self.belief = self.transition.after(self.belief, min(steps, self.most_steps))
         return prediction_codes(self.belief, self._prob_bits)
 
     def update(self, posterior: NDArray[np.float64] | None) -> None:
-        """Take the posterior of the frame as the belief; without one, the prediction remains."""
+        """Make the posterior of the frame the belief. If `posterior` is None, the prediction remains the belief."""
         if posterior is not None:
             self.belief = posterior
