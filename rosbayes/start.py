@@ -1,4 +1,4 @@
-"""The start and the end of every command: Ctrl-C during the imports exits with code 130, without a traceback."""
+"""The start and the end of every command. During the imports, Ctrl-C exits with code 130 and no traceback."""
 
 # nothing that takes long to import, because Ctrl-C still shows a traceback meanwhile
 import atexit

@@ -8,7 +8,7 @@ from terminal.output import say, warn
 
 
 def report_waits() -> Callable[[str, str, str], None]:
-    """Return a callback for the states of servers that prints, during a command's start, which ones it waits for."""
+    """Return a callback that prints which servers a starting command waits for, and when they are connected."""
     missing: set[str] = set()
 
     def on_state(uri: str, state: str, reason: str) -> None:
@@ -23,9 +23,9 @@ def report_waits() -> Callable[[str, str, str], None]:
 
 
 def report_connection(uri: str) -> Callable[[str, str], None]:
-    """Return a callback for a client's `on_state` that reports each lost and restored connection once.
+    """Return a callback for a client's `on_state`. The callback reports each lost and each restored connection once.
 
-    It turns off the client's own warnings, which would report each loss a second time.
+    The function also turns off the client's own warnings, because they would report each loss again.
     """
     log_libraries(logging.ERROR, "%(name)s: %(message)s")
     missing = ""
