@@ -99,7 +99,7 @@ class MessageDefinitions:
         return self._fillers[name]
 
     def fields(self, name: str) -> Mapping[str, tuple[str, int]]:
-        """Return the element type and length of each field of a known message type, in the form of `element_of`."""
+        """Return the element type and length of each field of a known message type, as `element_of` returns them."""
         if name in TIMES:
             return dict.fromkeys(_TIME_FIELDS[self.ros_version], ("uint32", -1))
         store, known = self._known(name)

@@ -233,7 +233,7 @@ def check_plot(path: Path) -> None:
 
 
 def draw_sweep(path: Path, name: str, points: Sequence[Point], front: Sequence[Point]) -> None:
-    """Plot total variation against cycles. A larger dot has more ALMs, and a circle marks a point of `front`."""
+    """Plot total variation against cycles. A larger dot has more ALMs, and a circle marks each point of `front`."""
     largest = max((point.alms or 0.0 for point in points), default=0.0) or 1.0
     kinds = sorted({(point.scale, point.rng) for point in points})
     beside = len(kinds) > _KINDS_INSIDE

@@ -210,8 +210,7 @@ class Subscriptions:
         return subscribed.numbers
 
     def has_left_out(self, topic: str) -> bool:
-        """Return whether the client stopped subscribing to a topic because its messages are too large for the
-        connection."""
+        """Return whether the client leaves a topic out because its messages are too large for the connection."""
         subscribed = self._subscribed.get(absolute(topic))
         return subscribed is not None and subscribed.left_out
 
