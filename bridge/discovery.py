@@ -1,10 +1,10 @@
 """Discovery of rosbridge servers on the local network by multicast DNS, as in Bonjour and Avahi.
 
 A server announces itself as an instance of the service `_rosbridge._tcp.local.`, under the name of the robot.
-Its properties are `path` of the URL, `tls`, `token` and `ros` (1 or 2). All are optional, so a line in the
+Its properties are `path` of the URL, `tls`, `token` and `ros` (1 or 2). All properties are optional, so a line in the
 configuration of Avahi is sufficient to announce a rosbridge server.
 
-`zeroconf` is an extra (`pip install zeroconf`), imported when one of these functions is called.
+The package `zeroconf` is optional (`pip install zeroconf`). The functions of this module import it when called.
 Data from the network is not trusted: its amount is limited, and announcements with unprintable names are ignored.
 
 Source: RFC 6762 and 6763.
@@ -46,13 +46,13 @@ _LOOPBACK: Final = ["127.0.0.1"]
 
 
 class DiscoveryError(BridgeError):
-    """Raised when discovery is impossible, without `zeroconf` or without a network."""
+    """Raised when discovery or an announcement is impossible, for example without `zeroconf` or a network."""
 
     exit_code: ClassVar[int] = 2
 
 
 class UnknownRobotError(BridgeError):
-    """Raised when no robot of this name announces a rosbridge server."""
+    """Raised when no robot of the requested name announces a rosbridge server in time."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,12 +135,12 @@ async def resolve(name: str, timeout: float = _TIMEOUT) -> str:
 
 
 async def announced_uri(uri: str, timeout: float = _TIMEOUT) -> str:
-    """Return the server's URI for `robot:NAME`, and any other URI unchanged; raise the errors of `resolve`."""
+    """If `uri` is `robot:NAME`, return the result of `resolve` for NAME. Otherwise, return `uri` unchanged."""
     return await resolve(uri.removeprefix(ROBOT), timeout) if uri.startswith(ROBOT) else uri
 
 
 def find_uri(uri: str, timeout: float = _TIMEOUT) -> str:
-    """Return the same as `announced_uri`, for callers outside an event loop."""
+    """Return the result of `announced_uri`, for callers outside an event loop."""
     return asyncio.run(announced_uri(uri, timeout)) if uri.startswith(ROBOT) else uri
 
 

@@ -19,11 +19,11 @@ if TYPE_CHECKING:
     from machines.kind import MachineKind
 
 FAST_CODES_MAX: Final = 2**24
-"""Maximum of columns * 2**prob_bits for the fast kernel, which has a table with an entry for each code of a column."""
+"""Maximum value of `columns * 2**prob_bits` for the fast kernel. The kernel has a table of this size."""
 
 
 def make_kernel(machine: "BM1Machine", *, boards: int = 1) -> "BM1Kernel":
-    """Return the fastest kernel that can run the machine; the kernel's cache has 1 / `boards` of the usual size."""
+    """Return the fastest kernel that can run the machine. Its cache has 1 / `boards` of the usual size."""
     parameters = machine.parameters
     codes = parameters.columns << parameters.prob_bits
     if parameters.shared and parameters.rng.lfsr_bits is not None and codes <= FAST_CODES_MAX:
@@ -70,7 +70,7 @@ def _bm2() -> "MachineKind":
 
 
 KINDS: Final[dict[str, Callable[[], "MachineKind"]]] = {"BM1": _bm1, "BM2": _bm2}
-"""By name, functions that import and return a kind of machine: kinds need NumPy, which not every process loads."""
+"""Functions that import and return a kind of machine, by the kind's name. Importing a kind also imports NumPy."""
 
 
 def kind_of(parameters: object) -> "MachineKind":

@@ -29,10 +29,10 @@ from machines.rng import LFSR, POLYNOMIALS, Words, jump_tables
 from machines.vectors import aligned, first_one, in_llvm, load, repeated, store
 
 CHUNK: Final = 32
-"""Number of cycles that are examined together, one for each bit of a mask."""
+"""Number of cycles that are examined together. A mask has a bit for each of the cycles."""
 
 STREAM_ROOM: Final = 4096
-"""Initial size in samples of a stream's buffer, which grows when needed."""
+"""Initial capacity of a stream's buffer, in samples. A full buffer is enlarged."""
 
 Integers = npt.NDArray[np.int64]
 
@@ -70,7 +70,7 @@ class Wiring(NamedTuple):
 
 
 class Moves(NamedTuple):
-    """The moves of a sweep, for an order of the sequencer and a set of known variables."""
+    """The moves of a Gibbs sweep. They depend on the order of the sequencer and on the set of known variables."""
 
     first: Words  # [moves + 1]: place of a move's first bit in `bits`
     bits: Words
@@ -78,7 +78,7 @@ class Moves(NamedTuple):
 
 
 class Chain(NamedTuple):
-    """The state of a chain between two cycles."""
+    """The state of a Markov chain between two clock cycles."""
 
     control: Integers  # [13]
     values: Words  # [variables]: codes of the state
@@ -136,7 +136,7 @@ class FastBM2(BM2Kernel):
 
     @property
     def stream(self) -> npt.NDArray[np.uint32]:
-        """A copy of the stream's buffer: uint32[samples since the last start or resume, state_words]."""
+        """A copy of the samples since the last start or resume: uint32[samples, state_words]."""
         return self._chain.stream[: self._chain.control[STREAMED]].copy()
 
     def _load(self, start: BM2Start) -> None:
@@ -189,12 +189,12 @@ def warm_up() -> None:
 
 
 def row_size(parameters: BM2Parameters) -> int:
-    """Return how many random numbers are stored for each CDE: a block of LFSR bits * `CHUNK`, and `CHUNK` more."""
+    """Return how many random numbers are stored for each CDE: `CHUNK` * (number of LFSR bits + 1)."""
     return (POLYNOMIALS[parameters.rng][0] + 1) * CHUNK
 
 
 def load_state(parameters: BM2Parameters, state: int, values: Words, addresses: Words) -> None:
-    """Write the variables' codes in a packed state to `values`, and the bits of every factor to `addresses`."""
+    """Unpack `state`: write the variables' codes to `values`, and the table address of each factor to `addresses`."""
     values[:] = unpack(parameters, state)
     bits = parameters.bits
     for cde, factor in enumerate(parameters.factors):
@@ -284,7 +284,7 @@ _NUMBERS: Final = ir.VectorType(ir.IntType(16), CHUNK)
 
 
 def compared(builder: Any, numbers: Any, place: Any, code: Any) -> Any:
-    """Compare the random numbers of a chunk with a code: bit i is 1 if `numbers[place + i]` is less than the code."""
+    """Build code that compares a chunk's random numbers with a code. Bit i is 1 if `numbers[place + i] < code`."""
     chunk = builder.load(builder.bitcast(builder.gep(numbers, [place]), _NUMBERS.as_pointer()))
     chunk.align = 2
     less = builder.icmp_unsigned("<", chunk, repeated(builder, code, _NUMBERS))
@@ -296,7 +296,7 @@ less_in_chunk: Final = in_llvm(types.uint64, None, types.int64, types.uint16)(co
 
 @jit
 def fill(wiring: Wiring, numbers: npt.NDArray[np.uint16], generators: Words, ones: int) -> None:
-    """Compute the first block of a chain's random numbers."""
+    """Compute the first block of a chain's random numbers, and write the block to `numbers`."""
     exponents = wiring.exponents
     for cde in range(generators.shape[0]):
         state = generators[cde]
@@ -333,7 +333,7 @@ def refill(exponents: Integers, numbers: npt.NDArray[np.uint16], first: int, row
 def run_chain(  # noqa: PLR0915 - a call of a function takes longer than a move
     wiring: Wiring, moves: Moves, chain: Chain, settings: Integers
 ) -> None:
-    """Run a chain until it has a reason to stop."""
+    """Run a chain until it stops, and write the reason to `chain.control`."""
     ops_timeout, samples_due, pause_at = settings[OPS_TIMEOUT], settings[SAMPLES_DUE], settings[PAUSE_AT]
     max_cycles, stream, room = settings[LIMIT], settings[STREAM], chain.stream.shape[0]
     random, every_move = settings[RANDOM], settings[EVERY_MOVE]

@@ -28,7 +28,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def jit(function: _Function) -> _Function:
-    """Compile a function, and cache it on disk if there is a writable folder."""
+    """Compile a function at its first call. If numba's cache folder is writable, the compiled code is cached there."""
     try:
         return cast("_Function", njit(cache=True, nogil=True)(function))
     except RuntimeError:  # no writable folder: every process compiles
@@ -76,7 +76,7 @@ class _Frame(NamedTuple):
 
 
 def store_of_codes(occurring: npt.NDArray[np.bool_], slots: int) -> _Store:
-    """Allocate words for all codes that may occur, without filling them."""
+    """Allocate a store with a row for each code that may occur. The words of the rows are not computed yet."""
     row_of_code = np.full(occurring.shape, NO_ROW, dtype=np.int32)
     row_column, row_code = np.nonzero(occurring)
     row_of_code[occurring] = np.arange(len(row_code), dtype=np.int32)
@@ -128,10 +128,10 @@ def make_frame(parameters: BM1Parameters, rows: int) -> _Frame:
 
 @cache
 def bit_tables(kind: RngKind, steps_per_clock: int, prob_bits: int) -> Words:
-    """Return the map from a state to the output bits in the next block: uint64[prob_bits, bits / 4, 16, BLOCK_WORDS].
+    """Return tables that map an LFSR's state to its output bits in the next block of cycles.
 
-    Unlike `machines.rng.map_tables`, it has a table per 4 bits of the state, so that all tables fit into the
-    processor's first caches.
+    The shape is uint64[prob_bits, bits / 4, 16, BLOCK_WORDS]. Each table is for 4 bits of the state. The tables are
+    smaller than those of `machines.rng.map_tables`, so that all tables fit into the processor's first caches.
     """
     clock = jump_tables(kind, steps_per_clock)[0]
     bits = LFSR(kind).bits
@@ -164,7 +164,7 @@ _ALL: Final = np.uint64(2**64 - 1)
 
 @jit
 def image(maps: Words, which: int, state: np.uint64) -> np.uint64:
-    """Return the image of a state under linear map number `which`."""
+    """Apply the linear map number `which` to a state, and return the new state."""
     found = _0
     for byte in range(maps.shape[1]):
         found ^= maps[which, byte, state & _BYTE]
@@ -280,7 +280,7 @@ def _count(words: Words, places: npt.NDArray[np.uint32], line: int, width: int, 
 def fill_blocks(
     generators: Generators, store: _Store, frame: _Frame, first_slot: int, blocks: int, period: int
 ) -> None:
-    """Compute the words of all codes for a bank's first `blocks` blocks, from the states in `frame.starts`."""
+    """Compute the words of all codes in the first blocks of a seed bank. `frame.starts` has the bank's start states."""
     for block in range(blocks):
         words = store.words[first_slot + block]
         filled = store.filled[first_slot + block]
@@ -425,6 +425,6 @@ def resume(
     kept_blocks: int,
     period: int,
 ) -> None:
-    """Run the next slice of the replicas `going`; the result is in `frame.outcome`."""
+    """Run the next slice of the replicas whose numbers are in `going`. Write the results to `frame`."""
     for replica in going:
         _run(generators, store, frame, replica, limit, target_count, first_slot, kept_blocks, period)

@@ -22,10 +22,10 @@ import numpy.typing as npt
 from machines.errors import StartError
 
 Blocks: TypeAlias = Mapping[str, bytes]
-"""Words to write, by the name of their block in the register map."""
+"""Words to write to registers, by the name of their block in the register map."""
 
 OUTCOME: Final = np.dtype([("reason", "<u4"), ("zero", "<u4"), ("cycles", "<u8")])
-"""The part of the block OUTCOMES that belongs to one replica."""
+"""The entry of one replica in the register block OUTCOMES: stop reason and cycles."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,7 +57,10 @@ class FrameInput:
 
 
 class FrameSettings(NamedTuple):
-    """The registers that start or resume a frame on every kind of machine, in the order of the map."""
+    """Values of the registers that a host writes to start or resume a frame, in the order of the register map.
+
+    Every kind of machine has these registers.
+    """
 
     target_count: int
     max_cycles: int
@@ -86,7 +89,7 @@ class BoardResult(msgspec.Struct, frozen=True, array_like=True, tag="board"):
 
     @property
     def counts(self) -> npt.NDArray[np.uint32]:
-        """A copy of the result words: uint32[results], with replicas uint32[replicas, results of each]."""
+        """A copy of the result words: uint32[results], or with replicas uint32[replicas, results per replica]."""
         counts = np.frombuffer(self.words, "<u4").astype(np.uint32)
         return counts.reshape(len(self.replica_cycles), -1) if self.replica_cycles else counts
 
@@ -116,7 +119,7 @@ class Inference(NamedTuple):
 
     @property
     def best(self) -> int:
-        """The most probable line of the posterior; -1 without a posterior."""
+        """The most probable line of the posterior, or -1 without a posterior."""
         return -1 if self.posterior is None else int(self.posterior.argmax())
 
 
@@ -163,20 +166,20 @@ class BoardMachine(ABC):
         self._memory = memory
 
     def prepare(self) -> None:
-        """Do in advance the work that would slow down the first frames, and reset the machine."""
+        """Prepare the machine, so that its first frames are not slower than later frames, and reset it."""
         self.reset()
 
     @abstractmethod
     def reset(self) -> None:
-        """Stop, clear results and cycles, and restart the RNGs from bank 0."""
+        """Stop the machine, clear its results and cycles, and restart its RNGs from bank 0 of the seeds."""
 
     @abstractmethod
     def start(self, settings: FrameSettings, end: int) -> None:
-        """Run a new frame, or raise a StartError and change nothing if the registers do not fit the machine."""
+        """Run a new frame. If the registers do not fit the machine, raise a StartError and change nothing."""
 
     @abstractmethod
     def resume(self, end: int) -> None:
-        """Run the next slice of the frame, or raise a StartError as `start` does."""
+        """Run the next slice of the frame. If the registers do not fit the machine, raise a StartError."""
 
     @abstractmethod
     def step(self, end: int) -> None:
@@ -185,7 +188,7 @@ class BoardMachine(ABC):
     @property
     @abstractmethod
     def paused(self) -> bool:
-        """True if the machine has stopped only because it has reached `end`: then `step` continues."""
+        """True if the machine has stopped only because it reached cycle `end`, so that `step` can continue."""
 
     @property
     def resumable(self) -> bool:
@@ -222,29 +225,29 @@ class FrameCourse(ABC):
     def proceed(
         self, reasons: Sequence[Sequence[int]], answers: Sequence[memoryview]
     ) -> tuple[Sequence[int], Blocks]:
-        """Return the numbers of the boards to resume (none if the frame is over), and the blocks to write first.
+        """Return the numbers of the boards to resume, and the blocks to write first. When the frame ends, there are none.
 
-        `reasons` are the last stop reasons of each board's replicas. `answers` are each board's words of
-        `UsedRegisters.answer`, valid until that board is resumed.
+        For each board, `reasons` has the last stop reasons of its replicas, and `answers` has the words of the blocks
+        in `UsedRegisters.answer`. A board's words are valid until the board is resumed.
         """
 
     def conclude(self, results: Sequence[BoardResult]) -> Sequence[BoardResult]:
-        """Return the frame's results; their `BoardResult.kept` is what this object stored during the slices."""
+        """Return the results. A subclass may add data that it stored during the slices, as `BoardResult.kept`."""
         return results
 
 
 def check_frame_value(name: str, value: int, lowest: int, highest: int) -> None:
-    """Refuse a value of a frame that is not from `lowest` to `highest`."""
+    """Raise a StartError if the value `name` of a frame is not from `lowest` to `highest`."""
     if not lowest <= value <= highest:
         raise StartError(f"{name} is {value}; this machine takes {lowest} to {highest}")
 
 
 class HostMachine(ABC):
-    """The machines of all boards, as the host sees them."""
+    """The host's interface to the machines of all boards."""
 
     @abstractmethod
     def begin(self, frame: FrameInput) -> FrameCourse:
-        """Return a frame's `FrameCourse`; a StartError if the frame does not fit the machines."""
+        """Return a frame's `FrameCourse`. Raises a StartError if the frame does not fit the machines."""
 
     @abstractmethod
     def slowest(self) -> FrameInput:
@@ -269,13 +272,13 @@ class MachineKind(ABC):
     # ---- programming file -----------------------------------------------------------------------------
 
     def sections(self, machine: Any) -> list[tuple[str, npt.NDArray[Any]]]:
-        """Return the tables of a machine in the order and types of the programming file."""
+        """Return the machine's tables as sections of a programming file: the name and the content of each section."""
         due = zip(self.due_sections(machine.parameters), machine.arrays, strict=True)
         return [(name, array.astype(words, copy=False)) for (name, words, _), array in due]
 
     @abstractmethod
     def due_sections(self, parameters: Any) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-        """Yield the name, type and shape of each section that a file must have; -1 is any length."""
+        """Yield the name, dtype and shape of each section that a file must have. Length -1 stands for any length."""
 
     @abstractmethod
     def machine(self, parameters: Any, sections: Mapping[str, npt.NDArray[Any]]) -> Any:
@@ -297,23 +300,23 @@ class MachineKind(ABC):
 
     @abstractmethod
     def on_board(self, kernel: Any, memory: Mapping[str, memoryview]) -> BoardMachine:
-        """Return a board's machine, which runs a kernel on registers: `memory` has every block of the map by name."""
+        """Return a board's machine, which runs `kernel` on registers. `memory` has the register blocks by name."""
 
     # ---- host -----------------------------------------------------------------------------------------
 
     @abstractmethod
     def on_host(self, machines: Sequence[Any]) -> HostMachine:
-        """Return the host's view of all boards' machines; `machines` are in the order of the partition."""
+        """Return the host's interface to all boards' machines. `machines` are in the order of the boards."""
 
     def joint_reason(self, reasons: Sequence[int]) -> int:
-        """Return one stop reason for a board's replicas after a frame; without replicas, the machine's own."""
+        """Combine the stop reasons of a board's replicas into one. Without replicas, return the only stop reason."""
         return reasons[0]
 
     @abstractmethod
     def infer(self, results: Sequence[BoardResult], variables: Sequence[str] = ()) -> Inference:
-        """Return the posterior for the results of all boards.
+        """Return the posterior that follows from the results of all boards.
 
-        `variables` are the names of the machine's variables, for messages.
+        `variables` has the names of the machine's variables. They appear in messages.
         """
 
     @abstractmethod

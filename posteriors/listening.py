@@ -6,7 +6,7 @@ With asyncio:
         async for posterior in posteriors(ros):
             print(posterior.number, posterior.best(), posterior.values.shape)
 
-and without:
+Without asyncio:
 
     listen("ws://robot:9090", lambda posterior: print(posterior.best()))
 
@@ -30,7 +30,7 @@ from posteriors.posterior import MAX_RESULT, RESULTS_TOPIC, RESULTS_TYPE, Poster
 from terminal.health import in_thread
 
 QUEUE_SIZE: Final = 64
-"""Default maximum number of posteriors that wait for their reader."""
+"""Default maximum number of posteriors that have arrived and that the reader has not taken yet."""
 FIRST_TIMEOUT: Final = 30.0
 """Default timeout for the first posterior, in seconds."""
 _DISORDER_NS: Final = 50_000_000
@@ -146,7 +146,7 @@ class Posteriors:
         raise await self.no_result_error(timeout)
 
     async def no_result_error(self, waited: float | None) -> NoResultError:
-        """Return the error for `waited` seconds without a frame, with the state of connection and topic."""
+        """Return the error for `waited` seconds without a frame. Its text names the likely cause."""
         ros = self._ros
         why = "is the master running, and do readings reach it?"
         if ros.state is not State.CONNECTED:
@@ -248,7 +248,7 @@ class Posteriors:
 
 
 posteriors: Final = Posteriors
-"""Another name of `Posteriors`, for loops: `async for posterior in posteriors(ros)`."""
+"""Alias of `Posteriors` for loops: `async for posterior in posteriors(ros)`."""
 
 
 def listen(

@@ -12,10 +12,10 @@ from posteriors.frame_report import FrameReport
 from posteriors.posterior import Posterior
 
 FrameOutcome = Posterior | FrameReport
-"""The posterior of a frame, or the report of a frame without one."""
+"""The posterior of a frame, or the report of a frame without a posterior."""
 
 WAITING: Final = 256
-"""Maximum number of reports, and of posteriors, that wait for their counterparts."""
+"""Maximum number of reports that wait for posteriors, and maximum number of posteriors that wait for reports."""
 
 
 class Pairing:
@@ -59,7 +59,7 @@ class Pairing:
         return ready
 
     def flush(self) -> list[FrameOutcome]:
-        """Return the posteriors that are still waiting: their reports are lost."""
+        """Remove and return the posteriors that still wait for reports. The reports are considered lost."""
         ended: list[FrameOutcome] = list(self._posteriors)
         self._posteriors.clear()
         return ended

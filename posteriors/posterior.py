@@ -1,4 +1,4 @@
-"""Posteriors as labelled arrays, shown in notebooks, and their conversion from and to messages on `/BMresults`."""
+"""Posteriors as labelled arrays: display in notebooks, and conversion from and to messages on `/BMresults`."""
 
 import base64
 import difflib
@@ -27,11 +27,11 @@ RESULTS_TYPE: Final = "std_msgs/Float64MultiArray"
 SAMPLES_TOPIC: Final = "/bm/samples"
 SAMPLES_TYPE: Final = "std_msgs/UInt8MultiArray"
 MAX_RESULT: Final = 1 << 23
-"""Maximum size of a posterior as JSON in bytes: 64 boards of 4096 cells, 26 bytes per number, and the rest
-of the message.
+"""Maximum size in bytes of a posterior as JSON. It has room for 64 boards of 4096 cells with 26 bytes per number,
+and for the rest of the message.
 """
 REPLICA: Final = "replica"
-"""Label of the first dimension of the posteriors of several replicas."""
+"""Label of the first dimension if an array contains the posteriors of several replicas."""
 
 _MAX_DIMENSIONS: Final = 32
 """Maximum number of dimensions of a NumPy array."""
@@ -51,17 +51,17 @@ class Posterior:
     each of them sums to 1. If all counts of a replica are 0, its probabilities are 0.
     """
     labels: tuple[str, ...]
-    """Names of the searched variables, in the order of the dimensions."""
+    """Names of the dimensions: the searched variables, and first `replica` if there are several replicas."""
     sizes: tuple[int, ...]
     """Number of values of each dimension."""
     heard_ns: int
-    """Arrival in this process, Unix time in nanoseconds."""
+    """Time of arrival in this process (Unix time in nanoseconds)."""
     report: FrameReport | None = None
-    """The frame's report from `/bm/frame`; None if it was lost."""
+    """The frame's report from `/bm/frame`, or None if the report was lost."""
     details: Mapping[str, str] = field(default_factory=dict)
     """Statistics of a BM2's samples, by their keys in `/bm/frame`; empty for a BM1."""
     dimensions: "tuple[Dimension, ...]" = ()
-    """Units and names of states of the labels; empty if the deployment is not known (`with_units`)."""
+    """Units and names of states for each label. Empty if the deployment is not known; see `with_units`."""
 
     @cached_property
     def values(self) -> "NDArray[np.float64]":
@@ -74,11 +74,14 @@ class Posterior:
 
     @property
     def replicas(self) -> int:
-        """Number of posteriors: the number of replicas of the deployment."""
+        """Number of posteriors in this object, one for each replica of the deployment."""
         return self.sizes[0] if self.labels[0] == REPLICA else 1
 
     def replica(self, at: int) -> "Posterior":
-        """Return the posterior of replica `at`, without the label `replica`, or raise a LabelError if it has none."""
+        """Return the posterior of replica `at`, without the label `replica`.
+
+        Raises a LabelError if the replica does not exist, or has no posterior in this frame.
+        """
         if not 0 <= at < self.replicas:
             raise LabelError(f"there is no replica {at}: expected 0 to {self.replicas - 1}")
         if self.labels[0] != REPLICA:
@@ -125,17 +128,17 @@ class Posterior:
 
     @property
     def number(self) -> int | None:
-        """Number of the frame, from 1 for each master; None if unknown."""
+        """Number of the frame, or None if unknown. Each master counts from 1."""
         return self.report.number if self.report else None
 
     @property
     def stamp_ns(self) -> int | None:
-        """Time of the reading, Unix time in nanoseconds; None if unknown."""
+        """Time of the reading (Unix time in nanoseconds), or None if unknown."""
         return self.report.stamp_ns if self.report else None
 
     @property
     def cycles(self) -> int | None:
-        """Number of cycles of the board that took the most; None if unknown."""
+        """Number of cycles of the board with the most cycles, or None if unknown."""
         return self.report.cycles if self.report else None
 
     @property
@@ -145,7 +148,7 @@ class Posterior:
 
     @property
     def latency_us(self) -> float | None:
-        """Microseconds from the receipt of the reading by the subscriber to the arrival here.
+        """Microseconds from the reading's receipt in the subscriber to the posterior's arrival in this process.
 
         None if unknown, or if the clocks of the two computers differ too much.
         """
@@ -168,7 +171,7 @@ class Posterior:
         return max(self.probabilities)
 
     def best(self) -> dict[str, int]:
-        """Return the most probable cell as an index from 0 for each label; if several are equal, the first."""
+        """Return the most probable cell as an index from 0 for each label. Of several equal cells, return the first."""
         line = self.probabilities.index(self.probability)
         indices: list[int] = []
         for size in reversed(self.sizes):
@@ -179,8 +182,8 @@ class Posterior:
     def mean(self) -> dict[str, float]:
         """Return the mean index of each label, from 0.
 
-        The value of an index is `offset + index * step` (`deployment.toml`), which is linear, so the mean
-        index corresponds to the mean value. The mean of a periodic variable (a heading) is not meaningful.
+        The value of an index is `offset + index * step` (`deployment.toml`). This is linear, so the mean index
+        gives the mean value. The mean of a periodic variable, such as a heading, is not meaningful.
         """
         means: dict[str, float] = {}
         for label, size in zip(self.labels, self.sizes, strict=True):
@@ -225,7 +228,7 @@ class Posterior:
         return abs(float((likely * np.log2(likely)).sum()))
 
     def total_variation(self, other: "Posterior") -> float:
-        """Return half the sum of the absolute differences, 0 to 1; raise a LabelError if the dimensions differ."""
+        """Return half the sum of the absolute differences, 0 to 1. Raises a LabelError if the dimensions differ."""
         import numpy as np
 
         ours, theirs = (list(zip(each.labels, each.sizes, strict=True)) for each in (self, other))
@@ -234,12 +237,12 @@ class Posterior:
         return float(np.abs(self.values - other.values).sum() / 2)
 
     def marginal(self, *labels: str) -> "NDArray[np.float64]":
-        """Return the marginal posterior of some searched variables; each may be named once.
+        """Return the marginal posterior of some searched variables.
 
         The float64 array has one dimension for each label, in the order given.
 
         Raises:
-            LabelError: A variable is not searched; the sentence suggests the nearest name.
+            LabelError: A label is named twice, or is not searched. The message suggests a similar name.
         """
         kept = [self._dimension(label) for label in labels]
         if len(set(kept)) != len(kept):
@@ -325,7 +328,7 @@ def _grid(dimensions: Iterable[tuple[str, int]]) -> str:
 
 
 def posterior_layout(deployment: "Deployment") -> dict[str, Any]:
-    """Return the `layout` of messages with a deployment's posteriors: dimensions with labels, row-major strides.
+    """Return the `layout` of messages with a deployment's posteriors: labels, sizes and row-major strides.
 
     With several replicas, the first dimension is labelled `replica`.
     """

@@ -220,7 +220,7 @@ class Child:
                 pipe.read(last=True)
 
     def failure(self) -> StackError:
-        """Return the process's exit as an error. The text is the reported error, or otherwise describes the exit code."""
+        """Return the process's exit as an error. Its text is the reported error, or else describes the exit code."""
         code = self.exit_code
         # the exit code of an error decides whether a restart would help, so it must not be lost
         if self._error:

@@ -5,8 +5,8 @@
     logging of libraries ──────────────────┤
     relayed lines of children ─────────────┘
 
-`BM_LOG_FORMAT` selects the format; children inherit it. Text from a peer is escaped, so that it can neither begin a
-line nor control a terminal.
+The environment variable `BM_LOG_FORMAT` selects the format, also for child processes. Text from a peer is escaped, so
+that the text can neither begin a line nor control a terminal.
 """
 
 import json
@@ -22,7 +22,7 @@ from typing import Final
 from terminal.one_line import lines_of, one_line
 
 PARENT_VARIABLE: Final = "ROSBAYES_PARENT"
-"""Environment variable that a process sets for its children, so that they exit when it does."""
+"""Environment variable with the parent's process id. A child with this variable exits when its parent exits."""
 FORMAT_VARIABLE: Final = "BM_LOG_FORMAT"
 
 _CLEAR_LINE: Final = "\r\x1b[K"
@@ -47,13 +47,13 @@ class LogFormat(StrEnum):
 
 
 def log_format() -> LogFormat:
-    """Return the current log format; text if the environment variable is invalid (the settings report the error)."""
+    """Return the current log format. If the environment variable is invalid, return text; the settings report it."""
     value = os.environ.get(FORMAT_VARIABLE, "")
     return LogFormat(value) if value in set(LogFormat) else LogFormat.TEXT
 
 
 def use_log_format(value: str) -> None:
-    """Use this format from now on, in this process and in its later children."""
+    """Use a log format from now on, in this process and in its later children."""
     os.environ[FORMAT_VARIABLE] = value
 
 
@@ -82,7 +82,7 @@ def _now() -> str:
 
 
 def formatted(level: str, text: str, *, name: str = "") -> str:
-    """Return a text for the user in the current format: `name: level: text`, or JSON with the level as a field."""
+    """Return a text for the user: as JSON with its level, as `name: level: text`, or at level `info` as text alone."""
     if log_format() is LogFormat.JSON:
         return json_line(level, text)
     prefix = f"{name}: " if name else ""
@@ -105,7 +105,7 @@ def _is_record(line: str) -> bool:
 
 
 def write_line(text: str) -> None:
-    """Print a text, already in the current format, on standard error."""
+    """Print a text on standard error. The text must already be in the current log format."""
     _write(text + "\n")
 
 
@@ -144,7 +144,7 @@ class Logger:
         self._log(logging.INFO, message, fields)
 
     def warning(self, message: str, **fields: object) -> None:
-        """Log something that the user should know, and that does not end the run."""
+        """Log a problem that the user should know about, but that does not end the run."""
         self._log(logging.WARNING, message, fields)
 
     def _log(self, level: int, message: str, fields: dict[str, object]) -> None:
@@ -173,14 +173,14 @@ def get_logger(role: str, level: str = "info") -> Logger:
 
 
 def log_libraries(level: int, form: str) -> None:
-    """Write libraries' log records of at least this level to standard error, one line each, in the format `form`."""
+    """Write libraries' log records of at least `level` to standard error. `form` is a format of `logging`."""
     handler = logging.StreamHandler()
     handler.setFormatter(_OneLine(form))
     logging.basicConfig(level=level, handlers=[handler])
 
 
 def escape_last_resort() -> None:
-    """Escape control characters in warnings of libraries, which may quote a server, while logging is not configured."""
+    """Escape control characters in libraries' warnings before logging is configured. A warning may quote a server."""
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(_OneLine())
 

@@ -22,7 +22,7 @@ from bridge.hub.limits import RefusedOperationError
 
 
 class Encoding(StrEnum):
-    """Encodings. If a client requests several for a topic, the hub uses the last in this order, like rosbridge_suite."""
+    """Encodings. If a client requests several for one topic, the last in this order applies (as in rosbridge_suite)."""
 
     NONE = "none"
     PNG = "png"

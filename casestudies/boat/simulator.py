@@ -1,4 +1,4 @@
-"""Simulator in place of Gazebo: a boat sails, or is driven or dragged, and its sensors' readings are published.
+"""Simulator instead of Gazebo. A boat sails by itself, or a user drives or drags it. Its readings are published.
 
 /cmd_vel ───────────────────────────▶ Boat ─▶ /boat/true_pose, /boat/imu, /boat/raw at each step
 /boat/set_pose, services /boat/... ─▶                                           and at once after a new pose or a call
@@ -65,7 +65,7 @@ SWITCHES: Final = {
     },
     **{f"{name}/plugged": (f"{name} is plugged in", f"{name} is unplugged") for name in SENSOR_NAMES},
 }
-"""The switches, which are services below `/boat/`, each with the sentences for on and off. All are on at first."""
+"""The switches by name, each with a sentence for on and for off. A switch is a service below `/boat/`, at first on."""
 _SWITCH_TYPE = "std_srvs/SetBool"
 _SHORE = 2.0  # waypoints are at least this far from the map's edge
 # Minimum number of seconds before a change causes another reading: a mouse moves 1000 times a second.
@@ -73,7 +73,7 @@ _SHORTEST = 0.02
 # A larger message on the topics that move the boat is neither a pose nor a velocity, and is discarded.
 _POSE_BYTES = 65_536
 DRIVE_TIMEOUT: Final = 1.0
-"""Seconds after a velocity command until the boat stops, unless another command arrives, as robots do."""
+"""Seconds until the boat stops after its last velocity command. Robots have a similar timeout."""
 
 
 class Boat:
@@ -102,13 +102,13 @@ class Boat:
         self.changed = asyncio.Event()
 
     def put(self, x: float, y: float) -> None:
-        """Put the boat at (x, y), or on the nearest shore if that is outside the map, and stop it there."""
+        """Put the boat at (x, y) and stop it. If (x, y) is outside the map, use the nearest point of the map."""
         self._place(x, y)
         self._driven = 0.0
         self.switch("sail", on=False)
 
     def drive(self, forward: float, turn: float) -> None:
-        """Move at this velocity for `DRIVE_TIMEOUT` seconds, at most at top speed; `turn` is in radians a second."""
+        """Move at a velocity for `DRIVE_TIMEOUT` seconds. `forward` is limited to the top speed; `turn` is in rad/s."""
         self._forward, self._turn = min(max(forward, -self._speed), self._speed), turn
         self._driven = DRIVE_TIMEOUT
         self.switches["sail"] = False
@@ -120,7 +120,7 @@ class Boat:
         return SWITCHES[name][0 if on else 1]
 
     def sail(self, seconds: float) -> None:
-        """Move the boat for that many seconds: along the waypoints, or as it is driven if `sail` is off."""
+        """Move the boat along its waypoints for `seconds`. If the switch `sail` is off, move it as it is driven."""
         if not self.switches["sail"]:
             driven = min(seconds, self._driven)
             self._driven -= driven
@@ -179,11 +179,12 @@ async def simulate(
     array: bool = False,
     count: int | None = None,
 ) -> None:
-    """Sail and publish `count` readings, or until cancelled; raise a BridgeError if no server answers at the URI.
+    """Sail the boat and publish `count` readings. If `count` is None, sail until cancelled.
 
     Each step publishes first the true pose, then the compass, then the readings, all with the same stamp. The readings
     on `topic` are a `boat_msgs/Raw`, or with `array` a std_msgs/Float64MultiArray. If somebody moves the boat or sets a
-    switch, readings are also published at once, between steps. While the server is away, the boat sails on.
+    switch, readings are also published at once, between steps. During a lost connection, the boat sails on. Raises a
+    BridgeError if no server answers at the URI.
     """
     from bridge.stamps import header
     from casestudies.topics import LossyPublication, connected, report_refused

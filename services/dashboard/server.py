@@ -1,4 +1,4 @@
-"""The web server of the dashboard: it runs in the event loop of this process, and handles no signals."""
+"""The web server of the dashboard. It runs in the event loop of this process, and handles no signals."""
 
 import asyncio
 import contextlib
@@ -33,10 +33,10 @@ class _Server(uvicorn.Server):
 
 
 class PageServer:
-    """The server of the page on a listening socket.
+    """The web server of the dashboard's page. It accepts connections on a socket that is already listening.
 
     Attributes:
-        ready: Set once the page can be opened.
+        ready: Event that is set when browsers can open the page.
     """
 
     def __init__(

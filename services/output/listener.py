@@ -30,13 +30,13 @@ async def show_frames(
     show: Show,
     file: ResultFile | None,
 ) -> int:
-    """Show and save frames until `count` posteriors have arrived.
+    """Show and save frames until `count` posteriors have arrived. None stands for any number of posteriors.
 
-    After the first frame, `silence` is the maximum number of seconds between two; None for no limit.
+    `silence` is the maximum number of seconds between two frames, or None for no limit.
 
     Raises:
         NoResultError: No frame arrived in time.
-        BadResultError: The first message does not come from a master.
+        BadResultError: The first message is not a result of a master.
         SettingsError: The posterior does not fit the deployment, or the file cannot be written.
         BridgeError: The server is unreachable, or is not a rosbridge server.
     """

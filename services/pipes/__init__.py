@@ -1,1 +1,1 @@
-"""Pipe mode of subscriber, pcie-app and publisher: JSON lines on standard streams, without a master."""
+"""Pipe mode: subscriber, pcie-app and publisher exchange JSON lines on standard streams, without a master."""

@@ -1,4 +1,4 @@
-"""Status of processes: the records, and queries of one process or of all in a run (`terminal.health`)."""
+"""Status of processes: its records, and queries of one process or of all processes in a run (`terminal.health`)."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class ConnectionStatus(msgspec.Struct, frozen=True):
 
 
 class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
-    """Counts of frames in one process, from zero when it is restarted."""
+    """Counts of frames in one process since the start of the process."""
 
     # Subscriber: messages, and complete readings. Master: readings, and published results. pcie-app: requested, and
     # computed frames. Publisher: requested, and published results.
@@ -68,7 +68,7 @@ class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
         last: tuple[int, int],
         without: Mapping[str, int] | None = None,
     ) -> FrameCounts:
-        """Return the counts; `last` is the last frame's number and time (monotonic ns), each 0 if there is none."""
+        """Return the counts. `last` is the number and the monotonic time (ns) of the last frame, or 0 if unknown."""
         number, tick = last
         return cls(
             received=received,
@@ -81,7 +81,7 @@ class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class BoardStatus(msgspec.Struct, frozen=True, kw_only=True):
-    """A board, as it reports itself, or as pcie-app sees it."""
+    """The state of a board, reported by the board's own process or by pcie-app."""
 
     index: int
     endpoint: str
@@ -105,11 +105,11 @@ class PeerStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 BUCKETS_S = tuple(digit * 10.0**exponent for exponent in range(-5, 1) for digit in (1, 2, 5))[:17]
-"""Upper bounds in seconds of the buckets that count latencies, from 10 us to 2 s; one more bucket has no bound."""
+"""Upper bounds in seconds of the latency histogram's buckets, from 10 us to 2 s. A last bucket has no upper bound."""
 
 
 class StageLatency(msgspec.Struct, frozen=True, kw_only=True):
-    """The latencies of one stage of the frames; the stage `frame` is the whole frame."""
+    """The latencies of one stage of processing a frame. The stage named `frame` is the whole processing."""
 
     stage: str
     # quantiles over the last 1000 published frames
@@ -122,7 +122,7 @@ class StageLatency(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class HubStatus(msgspec.Struct, frozen=True):
-    """Numbers of clients, topics and services of the hub, and its port."""
+    """The hub's port, and its numbers of clients, topics and services."""
 
     clients: int
     topics: int
@@ -159,7 +159,7 @@ class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SilentProcess(msgspec.Struct, frozen=True):
-    """A process with a status socket, or a peer of the master, that did not answer."""
+    """A process that did not report its status, although it has a status socket or the master waits for it."""
 
     name: str
     why: str
@@ -180,12 +180,12 @@ class StackStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def connections(rosbridges: Mapping[str, Ros]) -> list[ConnectionStatus]:
-    """Return the state of connections to rosbridge servers, by URI."""
+    """Return the state of each connection to a rosbridge server. `rosbridges` has the clients by the server's URI."""
     return [ConnectionStatus(uri, str(ros.state), ros.reconnections) for uri, ros in rosbridges.items()]
 
 
 def why_not_connected(rosbridges: Mapping[str, Ros]) -> str:
-    """Return the sentence for a process that waits for a rosbridge server; empty if all are connected."""
+    """Return a sentence that names the rosbridge server the process waits for, or "" if all are connected."""
     if not rosbridges:
         return "waiting for the rosbridge server"
     for uri, ros in rosbridges.items():
@@ -205,9 +205,10 @@ _BACKLOG_EVERY = 0.01
 
 
 async def read_process_status(path: str, timeout: float) -> ProcessStatus:
-    """Return the status of the process at a status socket, or raise a NoHealthError after `timeout` seconds.
+    """Return the status that a process reports at its status socket.
 
-    It does not use a thread, because Python waits for ever for a thread that cannot start for lack of memory.
+    Raises a NoHealthError if no valid status arrives within `timeout` seconds. The function does not use a thread,
+    because Python waits for ever for a thread that cannot start for lack of memory.
     """
     data = bytearray()
     loop = asyncio.get_running_loop()
@@ -266,8 +267,8 @@ def _is_foreign_hub(process: ProcessStatus, others: Iterable[ProcessStatus]) -> 
 async def ask_stack(directory: Path, *, shared: bool = False) -> StackStatus:
     """Return the status of the processes in a run directory, queried in parallel.
 
-    Processes in a `shared` directory may belong to several runs, so a hub that no service uses is left out.
-    Up to 256 processes take at most about a second.
+    If several runs share the directory (`shared`), the result leaves out a hub to which no process is connected.
+    The query of up to 256 processes takes at most about a second.
     """
     turns = asyncio.Semaphore(_AT_ONCE)
     answers = await asyncio.gather(*(_ask(path, turns) for path in _status_sockets(directory)))

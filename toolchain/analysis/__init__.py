@@ -1,6 +1,6 @@
-"""Analyses of a machine before it is on a board: accuracy, cycles, resources, energy.
+"""Analyses of a machine without a board: accuracy, cycles, resources, energy.
 
-The dataclasses here hold the command-line options of these analyses; they need no NumPy, so `--help` is fast.
+The dataclasses here hold the command-line options of the analyses. This module needs no NumPy, so `--help` is fast.
 """
 
 import itertools
@@ -27,7 +27,10 @@ Clock: TypeAlias = Annotated[
 ]
 DeviceName: TypeAlias = Annotated[str, typer.Option(help="FPGA of the boards.", metavar="proce-v-d8")]
 Progress: TypeAlias = Callable[[int], AbstractContextManager[Callable[[str], None]]]
-"""Opens a progress bar for a number of steps, and yields a function to call after each step with the text to show."""
+"""Type of a function that opens a progress bar for a number of steps.
+
+The context yields a function. The caller calls this function after each step, with the text to show.
+"""
 
 _Member = TypeVar("_Member", bound=StrEnum)
 _Numbers: TypeAlias = tuple[int, ...]
@@ -35,7 +38,7 @@ _Numbers: TypeAlias = tuple[int, ...]
 
 @dataclass(frozen=True, kw_only=True)
 class ReadingOptions:
-    """The options that choose the readings for a machine, and the hardware for which its costs are estimated."""
+    """The options that select the readings of an analysis, and the FPGA for its estimates."""
 
     readings: Annotated[
         Path | None,
@@ -54,7 +57,7 @@ class ReadingOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class InspectOptions(ReadingOptions):
-    """The options of an inspection of a deployment."""
+    """The options of `toolchain inspect`, which analyses a deployment."""
 
     tolerance_s: BagTolerance = 0.1
     frames: Annotated[
@@ -75,7 +78,7 @@ class InspectOptions(ReadingOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class Sweep:
-    """The options of a sweep, which measures one machine for each combination of the values in the LIST options.
+    """The options of a sweep. A sweep measures a machine for each combination of the values in the LIST options.
 
     The other options are the same for all machines.
     """
@@ -116,7 +119,7 @@ class Sweep:
         )
 
     def options(self) -> Iterator[BuildOptions]:
-        """Yield the build options of each machine of the sweep; a BuildError if there are none or too many."""
+        """Yield the build options of each machine. Raises a BuildError if there are no or too many combinations."""
         lists = self._lists()
         count = math.prod(map(len, lists))
         if not 0 < count <= MAX_POINTS:
@@ -170,7 +173,7 @@ def _members(flag: str, text: str, kind: type[_Member]) -> tuple[_Member, ...]:
 
 
 def with_unit(value: float, unit: str) -> str:
-    """Return a value as text with a unit, whose SI prefix leaves 1 to 999 before the decimal point."""
+    """Return a value as text with a unit. The SI prefix is chosen to leave 1 to 999 before the decimal point."""
     if value <= 0:
         return f"0 {unit}"
     prefixes = ("p", "n", "u", "m", "", "k", "M", "G")

@@ -1,4 +1,4 @@
-"""Answers about a network: its variables, and posteriors for known states, by exact inference and by a machine."""
+"""Answers about a network: its variables, and posteriors for known states from exact inference and from a machine."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -23,7 +23,7 @@ from toolchain.models.joint import JointDistribution, Question
 from toolchain.models.network import NetworkModel
 
 MOST_CANDIDATES: Final = 100
-"""Maximum number of variables of which every pair is tested for independence."""
+"""Maximum number of candidates for known variables. Every pair of candidates is tested for independence."""
 _MOST_ROWS: Final = 40
 _MOST_NAMES: Final = 8
 _BAR: Final = 24
@@ -32,23 +32,23 @@ _EIGHTHS: Final = " ▏▎▍▌▋▊▉"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MachineAnswer:
-    """The posterior of a machine with the default options of a build, on one board, from the first bank of seeds."""
+    """The posterior of a machine on one board, with the default build options and the first bank of seeds."""
 
     kind: str
     why: str
-    """The reason for this kind of machine, as a clause."""
+    """A clause that says why the machine is of this kind."""
     cycles: int
     stopped: str
     """The reason why the board stopped."""
     posterior: NDArray[np.float64] | None
-    """float64[lines], one value per combination of searched states; None if all counts are 0."""
+    """float64[lines], one value for each combination of searched states, or None if all counts are 0."""
     total_variation: float
-    """Total variation from the exact posterior; 1 if the machine has no posterior."""
+    """Total variation distance to the exact posterior, or 1 if the machine has no posterior."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
-    """The posterior of the searched variables together; the first variable varies slowest."""
+    """The joint posterior of the searched variables. Its lines are ordered with the first variable varying slowest."""
 
     network: str
     searched: tuple[Symbol, ...]
@@ -67,7 +67,7 @@ class Answer:
         return [int(each.argmax()) for each in (self.exact, ours) if each is not None]
 
     def as_json(self) -> str:
-        """Return the answer as a line of JSON, which has an object for each combination of states."""
+        """Return the answer as a line of JSON. Its list `posterior` has an object for each combination of states."""
         names = [each.name for each in self.searched]
         ours = self.machine.posterior if self.machine else None
         rows: list[dict[str, Any]] = [
@@ -83,7 +83,7 @@ class Answer:
         return json.dumps(content | {"map": best[0], "posterior": rows, "machine": found}) + "\n"
 
     def report(self, *, best: bool = False) -> str:
-        """Return the answer as bars and sentences; with `best`, only the most probable states."""
+        """Return the answer as bars and sentences. With `best`, show only the most probable states."""
         names, lines = [each.name for each in self.searched], self._lines
         given = ", ".join(f"{name}={state}" for name, state in self.known.items())
         columns = {"exact": self.exact}
@@ -172,12 +172,12 @@ def _machine_answer(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contents:
-    """A network's variables, the searched ones, and for each variable those that a BM1 cannot know together with it."""
+    """The variables of a network, the searched variables, and the pairs that a BM1 cannot have as known variables."""
 
     joint: JointDistribution
     searched: tuple[str, ...] = ()
     apart: Mapping[str, Sequence[str]]
-    """For each candidate, the other candidates that depend on it given the searched variables."""
+    """For each candidate for a known variable, the candidates that depend on it, given the searched variables."""
 
     def as_json(self) -> str:
         """Return the contents as one JSON object."""

@@ -13,10 +13,10 @@ from toolchain.models.network import NetworkModel, network_of
 def model_for(
     source: Model | Question, options: BuildOptions, bits: Sequence[str] = (), device: str | None = None
 ) -> tuple[Model | NetworkModel, str]:
-    """Return the model for the machine that the options ask for, and the reason for its kind, as a clause.
+    """Return the model of the machine to build, and a clause that says why the machine is a BM1 or a BM2.
 
-    `bits` (address bits of columns, as `NAME=BITS`) and the FPGA `device` are for a BM1 only. A ToolchainError
-    if the machine cannot be built, or a flag is for the kind that was not chosen.
+    Only a BM1 takes `bits` (address bits of columns, as `NAME=BITS`) and the FPGA `device`. Raises a ToolchainError
+    if the machine cannot be built, or if a flag is for the other kind of machine.
     """
     refusal = source.refusal() if isinstance(source, Question) else None
     choice = options.machine
@@ -41,7 +41,7 @@ def model_for(
 
 
 def network_for(source: Model | Question) -> NetworkModel:
-    """Return the network of any model or question, or raise a ModelError."""
+    """Return a model or a question as a Bayesian network. Raises a ModelError if there is no such network."""
     return source.network() if isinstance(source, Question) else network_of(source)
 
 

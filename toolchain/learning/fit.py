@@ -36,7 +36,7 @@ from toolchain.learning.fitted import (
 from toolchain.models.model import Known, Model
 
 LEAST_READINGS: Final = 10
-"""Minimum number of readings of a pool of variables; a pool with fewer keeps the values set by hand."""
+"""Minimum number of readings of a pool of variables. A pool with fewer readings keeps the values of the model."""
 
 _ROUNDS: Final = 1000
 _SETTLED: Final = 1e-10
@@ -51,7 +51,7 @@ class TrueCells:
     """The true position in each usable row."""
 
     rows: NDArray[np.int64]
-    """int64[n], the usable rows: every searched dimension has a true value, and it is inside the grid."""
+    """int64[n], the indices of the usable rows. In a usable row, all true values exist and are inside the grid."""
     lines: NDArray[np.int64]
     """int64[n], for each usable row, the line of the model's grid that contains the true position."""
     within: NDArray[np.float64]
@@ -69,11 +69,11 @@ class Support:
     readings: int
     """Number of the variable's readings in rows with a true position."""
     cells: int
-    """Number of lines in which the variable was read at least once."""
+    """Number of lines of the model with at least one reading of the variable."""
     median: float
-    """The median number of the variable's readings per line, over the lines that have any."""
+    """Median number of the variable's readings per line, over the lines with at least one reading."""
     refused: int
-    """Number of readings that are not values of the variable."""
+    """Number of readings that were not used, because they are not values of the variable."""
 
 
 def locate(model: Model, columns: Mapping[str, Sequence[object]], rows: int) -> TrueCells:
@@ -105,7 +105,7 @@ def fit_model(
     recordings: Sequence[FittedRecording],
     options: FitOptions,
 ) -> tuple[Fit, tuple[Support, ...]]:
-    """Learn from the rows with a true position; return the fit, and the amount of data behind each table."""
+    """Learn the tables from the rows with a true position. Return the fit, and the amount of data for each table."""
     if not len(truth.rows):
         raise ModelError(
             "no row has a true value inside the searched dimensions: is --truth right, and in the model's unit?"
@@ -182,9 +182,9 @@ def mixture(
 ) -> tuple[float, float, list[float]]:
     """Fit one normal to all variables together, and a share of outliers to each variable.
 
-    `residuals` are the readings of each variable minus the readings' means. Outliers of a variable are uniform over
-    its range, whose width is in `widths`. Without `bias`, the normal's mean is 0. Returns the normal's mean, its
-    standard deviation, and the shares.
+    For each variable, `residuals` has the differences between readings and expected readings. `widths` has the widths
+    of the variables' ranges. Outliers are uniform over the range. If `bias` is False, the normal's mean is 0. Returns
+    the normal's mean, its standard deviation, and the shares.
     """
     everything = np.concatenate(residuals)
     mean = float(np.median(everything)) if bias else 0.0

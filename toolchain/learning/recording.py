@@ -30,7 +30,7 @@ _STEP: Final = re.compile(r"(\w+)((?:\[\d{1,9}\])*)")
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """The columns of a recording that were asked for."""
+    """The requested columns of a recording."""
 
     path: Path
     """The file."""
@@ -39,7 +39,7 @@ class Recording:
     columns: dict[str, list[object]]
     """For each column name, the values of all rows. A value is a number, a text, or None if it is missing."""
     stamps: tuple[int, ...] = ()
-    """The time of each row in nanoseconds. A CSV file has times only if it has a time column and `stamped` is set."""
+    """The time of each row in nanoseconds. Empty for a CSV file, unless `read_recording` read its time column."""
 
 
 def read_recording(

@@ -1,4 +1,4 @@
-"""The files of a deployment, including the Quartus project: their contents, and their changes (thesis 3.2)."""
+"""The files of a deployment, including the Quartus project: making, comparing and writing them (thesis 3.2)."""
 
 import filecmp
 import re
@@ -85,7 +85,7 @@ foreach revision {{{" ".join(revisions)}}} {{
 
 
 class Change(StrEnum):
-    """The change to a file when `OutputFiles` are written."""
+    """How writing `OutputFiles` changes a file."""
 
     UNCHANGED = "unchanged"
     CHANGED = "changed"
@@ -98,9 +98,9 @@ class OutputFiles:
     """The files of a part of a deployment, for example of its MIFs, and a pattern for files of earlier builds."""
 
     contents: dict[str, Iterable[bytes]]
-    """For each path in the deployment's folder, the pieces of the file's content, which can be consumed once."""
+    """The pieces of each file's content, by the file's path in the deployment. Pieces may be iterated only once."""
     own: re.Pattern[str]
-    """Pattern of the paths of all files of this part, also in earlier builds; files not in `contents` are removed."""
+    """Pattern for the paths of this part's files in any build. Writing removes matching files not in `contents`."""
 
 
 _MEMORIES: Final = re.compile(
@@ -113,7 +113,7 @@ _PROJECT: Final = re.compile(rf"{PROJECT}\.(qpf|tcl)|{PROJECT}_board\d+\.qsf")
 
 
 def memory_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
-    """Return the MIFs and, for a BM1, `bm1_parameters.vhd` (thesis 3.2)."""
+    """Return the memory initialisation files (MIF), and for a BM1 also `bm1_parameters.vhd` (thesis 3.2)."""
     contents: dict[str, Iterable[bytes]] = {}
     if deployment.machine.type == "BM1":
         contents[PARAMETERS_FILE] = [parameters_vhd(deployment, images).encode()]
@@ -171,7 +171,7 @@ def image_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
 
 
 def filter_file(transition: Transition | None) -> OutputFiles:
-    """Return the file of a filter; none without a transition."""
+    """Return the file with a filter's transition, or no file if `transition` is None."""
     name = str(FilterSection.model_fields["file"].default)
     return OutputFiles(
         {} if transition is None else {name: [transition.content()]}, re.compile(re.escape(name))
@@ -184,7 +184,7 @@ def text_file(name: str, text: str) -> OutputFiles:
 
 
 def write_files(directory: Path, *parts: OutputFiles) -> list[tuple[str, Change]]:
-    """Write the parts' files one after the other, each atomically; return each file's path and change, sorted."""
+    """Write the parts' files one after the other, each atomically. Return each file's path and change, by path."""
     changes: dict[str, Change] = {}
     for part in parts:
         changes |= {name: _write(directory / name, pieces) for name, pieces in part.contents.items()}
@@ -196,7 +196,7 @@ def write_files(directory: Path, *parts: OutputFiles) -> list[tuple[str, Change]
 
 
 def compare_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change]]:
-    """Return the changes that `write_files` would make; files that differ only in comments are unchanged."""
+    """Return the changes that `write_files` would make. A file that differs only in comments counts as unchanged."""
     changes = dict.fromkeys(_stale(directory, files), Change.REMOVED)
     for name, pieces in files.contents.items():
         if not (directory / name).is_file():
@@ -208,7 +208,7 @@ def compare_files(directory: Path, files: OutputFiles) -> list[tuple[str, Change
 
 
 def present(directory: Path, files: OutputFiles) -> list[str]:
-    """Return the paths in the folder that belong to `files`: a build would replace or remove them."""
+    """Return the paths of existing files that match `files.own`. A build would replace or remove the files."""
     folders = ("", "boards", PARAMETERS_FILE.partition("/")[0], MEMORIES_FOLDER)
     paths = [path for folder in folders for path in (directory / folder).glob("*")]
     return [name for path in paths if files.own.fullmatch(name := path.relative_to(directory).as_posix())]
