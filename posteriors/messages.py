@@ -1,4 +1,4 @@
-"""Common base of the pydantic models for ROS messages of the result topics."""
+"""Base class and validation of the pydantic models for ROS messages on the result topics."""
 
 from typing import Any, TypeVar
 
@@ -10,7 +10,7 @@ Model = TypeVar("Model")
 
 
 class Part(BaseModel):
-    """A part of a ROS message; undeclared fields are ignored."""
+    """A ROS message or a part of a message. Undeclared fields are ignored."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 

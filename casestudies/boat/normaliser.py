@@ -33,12 +33,12 @@ def normalise_distance(raw: float) -> int:
 
 
 def normalise_bearing(raw: float) -> int:
-    """Return a bearing, given in radians, in whole degrees 0..359, rounded half up."""
+    """Convert a bearing from radians to whole degrees 0..359, rounded half up."""
     return math.floor(math.degrees(raw) + 0.5) % 360
 
 
 def normalise(raw: tuple[float | None, ...]) -> tuple[int | None, ...]:
-    """Return the machine's readings from raw ones, both in the order of `SENSOR_NAMES`; None if missing."""
+    """Normalise readings in the order of `SENSOR_NAMES`. A missing reading is None, and stays None."""
     return tuple(
         None
         if value is None
@@ -50,9 +50,9 @@ def normalise(raw: tuple[float | None, ...]) -> tuple[int | None, ...]:
 
 
 async def serve(uri: str, *, raw_topic: str, sensors_topic: str, array: bool) -> None:
-    """Normalise messages until cancelled; raise a BridgeError if no server answers at the URI.
+    """Normalise messages until cancelled. Raises a BridgeError if no server answers at the URI.
 
-    A message is dropped if a field is not a finite number, and each different error is reported once. A missing reading
+    If a field is not a finite number, the message is dropped. Each different error is reported once. A missing reading
     stays missing.
     """
     from casestudies.topics import LossyPublication, connected, report_refused

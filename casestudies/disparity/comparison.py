@@ -1,4 +1,4 @@
-"""Comparison of the machines' disparities with float64 fusion, the truth and the thesis, printed and drawn."""
+"""Comparison of the machines' disparities with float64 fusion, the truth and the thesis, as text and as a picture."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 from terminal.pictures import new_figure, save_figure
 
 THESIS_S: Final = 0.6
-"""Seconds for the matching costs of a pair on the thesis's host (4.4); the thesis does not give the images' size."""
+"""Seconds in which the thesis's host computes the matching costs of a pair (4.4). The thesis gives no image size."""
 UNKNOWN: Final = -1.0
-"""The disparity that stands for a pixel without a posterior."""
+"""The value that replaces the disparity of a pixel without a posterior."""
 _BAD: Final = 1.0
 """Largest error in pixels for which a disparity is not counted as bad."""
 HEADING: Final = "pair  host (ms)  pairs/s  projected/s    cycles  bad float64  bad BM1  agreement  variation"
 
 
 def most_probable(posterior: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return each pixel's most probable disparity; `UNKNOWN` if all its probabilities are 0.
+    """Return each pixel's most probable disparity, or `UNKNOWN` if all probabilities of the pixel are 0.
 
     `posterior` is float64[disparities, height, width].
     """
@@ -27,7 +27,7 @@ def most_probable(posterior: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def bad_share(disparity: NDArray[np.float64], truth: NDArray[Any]) -> float:
-    """Return the share of the pixels with a known truth whose disparity is wrong by more than one pixel."""
+    """Return the share of pixels with an error above one pixel, among the pixels with a known true disparity."""
     known = np.isfinite(truth)
     return float((np.abs(disparity - truth)[known] > _BAD).mean()) if known.any() else 0.0
 
@@ -41,17 +41,17 @@ class Matched:
 
     left: NDArray[np.uint8]
     truth: NDArray[Any] | None
-    """True disparities, float32[height, width], NaN where the right camera does not see the point; None if unknown."""
+    """True disparities, float32[height, width], or None if unknown. Points hidden from the right camera have NaN."""
     exact: NDArray[np.float64]
     """The posteriors of float64 fusion."""
     posterior: NDArray[np.float64]
-    """The posteriors of the machines; zeros for a pixel without one."""
+    """The posteriors of the machines. A pixel without a posterior has zeros."""
     host_s: float
     """CPU time for filters, costs and likelihoods."""
     total_s: float
-    """Time from the pair to the last posterior."""
+    """Seconds from the start of the matching to the last posterior."""
     boards_s: float
-    """Time of the boards' cycles at the clock of real boards, without transfers over the links."""
+    """Seconds that the boards' cycles would take at the clock of real boards, without transfers over links."""
     cycles: int
 
     @property
@@ -73,7 +73,7 @@ class Matched:
         )
 
     def summary(self) -> str:
-        """Return a sentence with the times, next to the time in the thesis."""
+        """Return a sentence that compares the times with the time in the thesis."""
         height, width = self.left.shape
         return (
             f"a pair of {width} x {height} pixels takes {self.host_s:.3f} s on the host ({THESIS_S} s in the thesis, of "
@@ -82,7 +82,7 @@ class Matched:
 
 
 def draw(path: Path, matched: Matched) -> None:
-    """Draw the left image, the truth, and the disparities of float64 and of the machines; may raise an OutputError."""
+    """Draw the left image, and the disparities of the truth, of float64 fusion and of BM1, or raise an OutputError."""
     figure = new_figure(8, 5.6)
     panels = figure.subplots(2, 2).ravel()
     panels[0].imshow(matched.left, cmap="gray", vmin=0, vmax=255)

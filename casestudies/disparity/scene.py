@@ -1,7 +1,7 @@
-"""Renderer of stereo pairs: spheres and boxes with a solid texture in front of a wall, seen by two rectified cameras.
+"""Renderer of stereo pairs. Two rectified cameras see spheres and boxes with a solid texture in front of a wall.
 
-Positions are in metres, from the left camera: x to the right, y down, z forward. The right camera is `BASELINE` to the
-right of the left one.
+Positions are in metres from the left camera: x points right, y down, and z forward. The right camera is `BASELINE` to
+the right of the left camera.
 """
 
 from dataclasses import dataclass
@@ -15,11 +15,11 @@ Array: TypeAlias = NDArray[np.float64]
 BASELINE: Final = 0.1
 """Distance between the cameras in metres."""
 FOCAL: Final = 1.0
-"""Focal length of the cameras, in widths of an image."""
+"""Focal length of the cameras, as a multiple of the image's width."""
 NOISE: Final = 1.5
 """Standard deviation of the cameras' noise, in grey levels."""
 RIGHT_GAIN: Final = 0.95
-"""Brightness of the right image relative to the left one, because two cameras are never equal."""
+"""Brightness of the right image relative to the left image, because real cameras also differ."""
 _OCTAVES: Final = tuple(1.6 / 2**octave for octave in range(8))
 """Periods of the texture, in metres."""
 _TOLERANCE: Final = 1e-6
@@ -28,13 +28,13 @@ _TOLERANCE: Final = 1e-6
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pair:
-    """A rectified pair of images, and the true disparities and occlusions of the left one."""
+    """A rectified stereo pair, and the true disparities and occlusions of the left image."""
 
     left: NDArray[np.uint8]
     """uint8[height, width]: grey levels."""
     right: NDArray[np.uint8]
     disparity: Array
-    """float64[height, width]: true disparity, the pixels by which a point is further left in the right image."""
+    """float64[height, width]: true disparity. A point is this many pixels further left in the right image."""
     occluded: NDArray[np.bool_]
     """bool[height, width]: true for a pixel whose point is hidden from the right camera or outside the right image."""
 
@@ -74,10 +74,10 @@ class _Box:
 
 
 class Scene:
-    """A wall, a floor, and spheres and boxes of random places and sizes, which sway from pair to pair."""
+    """A wall and a floor, with spheres and boxes of random size. Spheres and boxes move from pair to pair."""
 
     def __init__(self, seed: int) -> None:
-        """Place everything; the same seed makes the same pairs."""
+        """Choose a scene at random. Equal seeds give equal pairs."""
         self._seed = seed
         random = np.random.default_rng(seed)
         self._spheres = [
@@ -93,7 +93,7 @@ class Scene:
         self._lattices = random.uniform(-1, 1, (len(_OCTAVES), 32, 32, 32))
 
     def pair(self, number: int, width: int, height: int) -> Pair:
-        """Render pair `number`, counted from 0: both images, with noise, and the true disparities of the left one."""
+        """Render the pair `number`, from 0: two noisy images, and the true disparities of the left image."""
         things = self._things(number)
         down, across = np.mgrid[:height, :width] + 0.5
         focal = FOCAL * width

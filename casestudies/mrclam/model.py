@@ -1,6 +1,6 @@
-"""The robot's model: P(range | cell) and P(bearing | cell) for each landmark, with an outlier floor.
+"""The model of a robot's position: P(range | cell) and P(bearing | cell) for each landmark, with a floor for outliers.
 
-The columns are range_6, bearing_6, range_7, bearing_7, ... for the landmarks in the order of the landmarks' file. The
+The machine's columns are range_6, bearing_6, range_7, bearing_7 and so on, in the order of the landmarks' file. The
 line of a cell is y * width + x, from the lower left corner. Readings of a landmark that is not seen are missing.
 """
 
@@ -34,7 +34,7 @@ class Landmark:
 
 
 def read_landmarks(path: Path) -> tuple[Landmark, ...]:
-    """Return the landmarks in a CSV file (landmark, x_m, y_m), in the file's order, or raise a ModelError."""
+    """Return the landmarks of a CSV file (landmark, x_m, y_m) in order, or raise a ModelError for an invalid file."""
     columns = read_recording(Path(path), ("landmark", "x_m", "y_m")).columns
     found: dict[int, Landmark] = {}
     for row, values in enumerate(zip(*columns.values(), strict=True), start=1):

@@ -1,6 +1,6 @@
-"""Connections to the rosbridge servers of a deployment, and what the servers know about its topics.
+"""Connections to a deployment's rosbridge servers, and checks of the deployment's topics at the servers.
 
-`connect_all` connects each server once. If a server has rosapi, it is asked whether a topic of readings has a
+`connect_all` connects to each server once. If a server has rosapi, it can say whether a topic of readings has a
 publisher, and whether results can be received.
 """
 
@@ -19,12 +19,12 @@ from services.settings import Settings
 from terminal.one_line import shown
 
 OnState = Callable[[str, State, str], None]
-"""Callback with the URI of a server, the new state of its connection, and the reason."""
+"""Callback that gets a server's URI, the new state of the connection, and the reason for the change."""
 
 AFTER: Final = 2.0
-"""Seconds to wait for a topic's publisher to appear, before a report that suggests similar names."""
+"""Seconds after which a topic without a publisher is reported."""
 ROSAPI_TIME = 2.0
-"""Seconds in which rosapi may answer. Many servers lack it; then nothing is known about their topics."""
+"""Seconds to wait for an answer of rosapi. Many servers lack rosapi, so nothing is known about their topics."""
 SETTLED_TIME = 3.0
 """If a server does not list an advertised topic after this many seconds, the topic counts as refused."""
 CHECK_INTERVAL = 10.0
@@ -67,7 +67,7 @@ async def connect_all(
 
 
 def reconnect_now(rosbridges: Mapping[str, Ros]) -> None:
-    """Try at once to reach the lost servers, because another service has reached one."""
+    """Try to reconnect to all lost servers at once. Services do this when another service has reached a server."""
     for ros in rosbridges.values():
         ros.reconnect_now()
 
@@ -76,7 +76,7 @@ def reconnect_now(rosbridges: Mapping[str, Ros]) -> None:
 
 
 async def report_unpublished(ros: Ros, topic: str, report: Callable[[str], None]) -> None:
-    """Report a topic, with similar names, if according to rosapi it has no publisher after `AFTER` seconds."""
+    """After `AFTER` seconds, report a topic if rosapi knows no publisher of it. The report suggests similar names."""
     # a publisher that starts at the same time is not missing
     await asyncio.sleep(AFTER)
     if await ros.publishers(topic) != []:
@@ -89,14 +89,14 @@ async def report_unpublished(ros: Ros, topic: str, report: Callable[[str], None]
 
 
 async def report_unused_clock(ros: Ros, topic: str, report: Callable[[str], None]) -> None:
-    """Report after `AFTER` seconds if `topic` (`/clock`) has a publisher although --use-sim-time is not set."""
+    """After `AFTER` seconds, suggest --use-sim-time in a report if `topic` (`/clock`) has a publisher."""
     await asyncio.sleep(AFTER)
     if await ros.publishers(topic):
         report(f"{topic} is published at {ros.uri}: if it is a simulation, pass --use-sim-time")
 
 
 async def check_types(topics: Iterable[tuple[Ros, str, str]]) -> None:
-    """Raise a NotReceivableError if a topic is published with another type than ours, according to rosapi."""
+    """Raise a NotReceivableError if rosapi says that a topic is published with another type than the given type."""
     asked = list(topics)
     types = await asyncio.gather(*(ros.topic_type(topic, ROSAPI_TIME) for ros, topic, _ in asked))
     for known, (ros, topic, own) in zip(types, asked, strict=True):
@@ -109,7 +109,7 @@ async def check_types(topics: Iterable[tuple[Ros, str, str]]) -> None:
 
 
 class NotReceivableError(BridgeError):
-    """Raised if readings, or the result of a run of one frame, cannot be received."""
+    """Raised if readings cannot be received from a topic, or if a server does not pass published messages on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +125,7 @@ class AdvertisedTopic:
 
 
 def reported_refusals(topics: Iterable[AdvertisedTopic]) -> dict[str, str]:
-    """Return the topics that a server has reported as refused, each with a sentence that says why."""
+    """Return, by topic name, the reasons why servers refused topics, according to their status messages."""
     return {
         topic.name: f"{topic.name} cannot be received at {topic.uri}: {shown(status.text[:200])}; {_way_out(topic)}"
         for topic in topics
@@ -135,9 +135,9 @@ def reported_refusals(topics: Iterable[AdvertisedTopic]) -> dict[str, str]:
 
 
 async def refusals(topics: Iterable[AdvertisedTopic], *, settled: bool) -> dict[str, str]:
-    """Return, by topic, why topics cannot be received, according to rosapi.
+    """Ask rosapi which topics cannot be received, and return the reasons by topic name.
 
-    With `settled`, the servers have had time to register the topics, so an unknown topic counts as refused.
+    `settled` says that the servers have had time to register the topics. An unknown topic then counts as refused.
     """
     asked = list(topics)
     found = await asyncio.gather(*(_refusal(topic, settled=settled) for topic in asked))

@@ -1,4 +1,4 @@
-"""`publisher` without a master: it publishes results that it reads from standard input."""
+"""The `publisher` that runs without a master: it publishes results from standard input."""
 
 import time
 from collections import Counter

@@ -1,8 +1,8 @@
 """Findings about random numbers: their period, generator steps per cycle, and relations between columns.
 
-A bit of an LFSR's state is a linear function of the initial state. Columns use the same sequence with
-different phases, so bits of the random numbers of two to four columns may XOR to 0 in every cycle. Then the
-columns are not independent, their AND is wrong permanently, and no number of cycles averages this out.
+A bit of an LFSR's state is a linear function of the initial state. Columns use one sequence with different phases.
+So a few random bits of two to four columns may XOR to 0 in every cycle. Such columns are not independent. The AND of
+their bits then has an error that no number of cycles averages out.
 """
 
 import math
@@ -25,7 +25,7 @@ _RANDOM_SIGMAS: Final = 5
 
 
 def generator_findings(machine: CheckedMachine) -> Iterator[Finding]:
-    """Find random numbers that repeat, are shared, or are related between columns."""
+    """Find random numbers that repeat or share bits, and columns with related random numbers."""
     parameters = machine.parameters
     if parameters.rng is RngKind.IDEAL:
         what = "these generators exist only in emulation, so there is no hardware project"
@@ -41,9 +41,9 @@ def generator_findings(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def fresh_numbers(p: BM1Parameters | BM2Parameters, effect: str) -> Iterator[Finding]:
-    """Find random numbers that every frame uses again, or that share bits with the random numbers of the next cycle.
+    """Find random numbers that are equal in every frame, or that share bits with the next cycle's random numbers.
 
-    `effect` says what shared bits do to the results, as a clause.
+    `effect` is a clause that says what shared bits do to the results.
     """
     if p.rng_banks == 1 and p.rng_reset is RngReset.BANK:
         what = (
@@ -160,14 +160,14 @@ def _table_correlation(
 
 
 Bit = tuple[int, int]
-"""A column (0 is the prior), and a bit of its random numbers (0 is the lowest)."""
+"""Index of a column (0 is the prior), and index of a bit of the column's random numbers (0 is the lowest)."""
 
 _MOST_PAIRS: Final = 20_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """Bits of a group that XOR to 0 in every cycle; a group is a bank or, with a generator per cell, a bank's line."""
+    """Bits of a group that XOR to 0 in every cycle. A group is a bank or, with a generator per cell, a line of a bank."""
 
     group: int
     bits: tuple[Bit, ...]
@@ -176,9 +176,9 @@ class Relation:
 def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> tuple[list[Relation], int]:
     """Search groups of columns for relations of 2, 3 or 4 bits, as many groups as a few seconds permit.
 
-    The bits of the columns of a group are ANDed by the machine. `seeds` are uint64[groups, columns]; the low
-    `prob_bits` bits of a state are the random number that is compared with a code. Returns at most one relation, of the
-    fewest bits, for each group, and the number of groups that were searched.
+    The machine ANDs the bits of the columns in a group. `seeds` are uint64[groups, columns]. The random number that is
+    compared with a code is the low `prob_bits` bits of a state. Returns one relation with the fewest bits for each
+    group that has relations, and the number of searched groups.
     """
     groups, columns = seeds.shape
     bits = columns * prob_bits

@@ -1,4 +1,4 @@
-"""The sections of `deployment.toml`, each checked separately, and the types of their values (thesis 3.3, 3.4)."""
+"""The sections of `deployment.toml`, and the types of their values (thesis 3.3, 3.4). Each section is checked alone."""
 
 import re
 from collections import Counter
@@ -44,11 +44,11 @@ MESSAGE_PATH = re.compile(r"[A-Za-z_][A-Za-z0-9_]*(?:\.[A-Za-z_][A-Za-z0-9_]*|\[
 
 
 ROBOT: Final = "robot:"
-"""Prefix of a URI that names a robot, which the services look up when they start."""
+"""Prefix of a URI that names a robot. The services look up the robot's address when they start."""
 
 
 def websocket_uri(uri: str) -> str:
-    """Return a WebSocket URI or `robot:NAME`, or raise a ValueError."""
+    """Return `uri` if it is a WebSocket URI or `robot:NAME`. Otherwise raise a ValueError."""
     if re.fullmatch(rf"{ROBOT}[0-9]+(/.*)?", uri):
         raise ValueError(f"{uri!r} would be a robot whose name is a number; did you mean 'ws://{uri}'?")
     if uri.startswith(ROBOT) and uri.removeprefix(ROBOT).strip() and uri.isprintable():
@@ -110,15 +110,15 @@ MessageType = Annotated[
 _A_PATH = "a path in a message; expected one like 'pose.position.x', 'ranges[3]' or a field's name"
 MessagePath = Annotated[str, _matching(MESSAGE_PATH, _A_PATH)]
 PathOrName = Annotated[str, _matching(re.compile(f"(?:{MESSAGE_PATH.pattern})?"), _A_PATH)]
-"""A path of a field in a message, or an empty text to search the message for the name of the variable."""
+"""Path of a field in a message. If the path is empty, the message is searched for the name of the variable."""
 Name = Annotated[str, Field(min_length=1, max_length=NAME_MAX), AfterValidator(_printable)]
-"""A name: one printable line, which is checked because names also come from network files."""
+"""A name of one printable line. Names are checked, because they may come from network files."""
 Sha256 = Annotated[str, _matching(_SHA256, "a SHA-256 hash; expected 64 hexadecimal digits")]
 OwnPath = Annotated[str, AfterValidator(_inside)]
-"""A file path inside the folder of the deployment."""
+"""Path of a file inside the folder of the deployment."""
 Step = Annotated[float, AfterValidator(_not_zero)]
 TOPIC_BYTES_MIN, TOPIC_BYTES_MAX = 1 << 10, 1 << 28
-"""The smallest and the largest value of `topic_bytes`, the limit on a message's size, in bytes."""
+"""The smallest and the largest value of `topic_bytes`, the maximum size in bytes of a topic's message."""
 TopicBytes = Annotated[int, Field(ge=TOPIC_BYTES_MIN, le=TOPIC_BYTES_MAX)]
 
 Item = TypeVar("Item")
@@ -128,19 +128,19 @@ Choice = Annotated[Item, Field(strict=False)]
 Unit = Annotated[
     str, Field(max_length=NAME_MAX, exclude_if=lambda unit: not unit), AfterValidator(_printable)
 ]
-"""A unit such as m; an empty one is omitted from the file."""
+"""A unit such as m. An empty unit is omitted from the file."""
 # empty states are omitted from the file and from its hash
 States = Annotated[tuple[Name, ...], Field(strict=False, exclude_if=lambda states: not states)]
 
 
 def states_fit(name: str, states: tuple[str, ...], size: int) -> None:
-    """Raise a ValueError if a variable has names of states, but not `size` of them."""
+    """Raise a ValueError if the number of the variable's named states is neither 0 nor `size`."""
     if states and len(states) != size:
         raise ValueError(f"{name} has {size} values, but {len(states)} states are named")
 
 
 def names_differ(kind: str, names: list[str]) -> None:
-    """Raise a ValueError if several entries of one kind have the same name."""
+    """Raise a ValueError if two entries of a kind have equal names."""
     twice = [name for name, count in Counter(names).items() if count > 1]
     if twice:
         raise ValueError(f"[[{kind}]] has {twice[0]!r} twice; names must differ")
@@ -156,40 +156,40 @@ class Stop(StrEnum):
     """The stop rule for the boards of a partitioned machine."""
 
     SLICES = "slices"
-    """All boards stop at the end of the slice (section of a frame) in which the first counter overflows."""
+    """A frame runs in slices. All boards stop at the end of the slice in which the first counter overflows."""
     OWN = "own"
     """Each board stops when one of its own counters overflows, as in the thesis."""
 
 
 class Queue(StrEnum):
-    """The choice of the readings that wait if readings arrive faster than frames are computed."""
+    """The readings that wait if readings arrive faster than the boards compute frames."""
 
     LATEST = "latest"
-    """Only the newest reading waits; the readings that it replaces are counted."""
+    """Only the newest reading waits. Replaced readings are counted."""
     ALL = "all"
     """All readings wait, in order of arrival."""
 
 
 class Scale(StrEnum):
-    """The parts of a table that are each divided by their maximum before quantising."""
+    """The parts of a probability table that are scaled before quantising. Each part is divided by its maximum."""
 
     ADDRESS = "address"
-    """Each row, the part of the table for one address; with this choice, the machine needs the fewest cycles."""
+    """Each row (the probabilities for one address) is a part. With this choice, a machine needs the fewest cycles."""
     COLUMN = "column"
-    """The whole table of a column, which keeps the ratios of its rows."""
+    """The whole table of a column is one part. This choice keeps the ratios between rows."""
     NONE = "none"
-    """No division: the codes are those of the raw probabilities."""
+    """No part is divided. The codes represent the raw probabilities."""
 
 
 class Section(BaseModel):
-    """Base class of all sections: strict (`"8"` is not an integer), frozen, and without unknown keys."""
+    """Base class of all sections. It is frozen, refuses unknown keys, and does not convert `"8"` to an integer."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, allow_inf_nan=False, validate_by_name=True
     )
 
     def replace(self, **changes: Any) -> Self:
-        """Return a copy with some fields replaced, or raise a ValidationError."""
+        """Return a copy with the given fields replaced, or raise a ValidationError."""
         return type(self)(**dict(self) | changes)
 
 
@@ -268,12 +268,12 @@ class Dimension(Section):
         return self
 
     def value(self, index: float) -> float:
-        """Return the value of the variable at an index: the centre of a cell if the index is whole."""
+        """Return the variable's value at an index. A whole index gives the centre of a cell."""
         return self.offset + index * self.step
 
 
 class CommonSection(Section):
-    """The part of `[machine]` that every kind of machine has."""
+    """The keys of `[machine]` that every kind of machine has."""
 
     type: str
     lines: int = Field(ge=1)
@@ -319,11 +319,11 @@ class BM1Section(CommonSection):
     )
     replicas: int = Field(default=1, ge=1, le=REPLICAS_MAX, exclude_if=lambda replicas: replicas == 1)
     is_divided: ClassVar[bool] = True
-    """True for a BM1, of which each board has a part of the lines; False if each board has the whole machine."""
+    """True if each board has only a part of the lines, as in a BM1. False if each board has the whole machine."""
     stream: ClassVar = 0
-    """Number of sampled states that a board buffers for publication; always 0, because a BM1 does not sample states."""
+    """Number of sampled states that a board buffers for publication. A BM1 samples no states, so the number is 0."""
     variables: ClassVar[tuple[str, ...]] = ()
-    """Names of the variables in a sampled state; none, because a BM1 does not sample states."""
+    """Names of the variables in a sampled state. A BM1 samples no states, so there are no names."""
 
     @model_validator(mode="after")
     def _target_fits(self) -> Self:
@@ -344,12 +344,12 @@ class BM1Section(CommonSection):
 
     @property
     def is_plain(self) -> bool:
-        """True for a machine without replicas, with one reading per column: a result is then one posterior."""
+        """True for a machine without replicas and with one reading per column. A result is then one posterior."""
         return self.replicas == 1 and not self.reads_lines
 
     @property
     def results(self) -> int:
-        """The number of probabilities in the result of a frame: one per line and replica."""
+        """The number of probabilities in the result of a frame: one for each line of each replica."""
         return self.replicas * self.lines
 
 
@@ -397,7 +397,7 @@ def _type_of(section: Any) -> Any:
 MachineSection: TypeAlias = Annotated[
     Annotated[BM1Section, Tag("BM1")] | Annotated[BM2Section, Tag("BM2")], Discriminator(_type_of)
 ]
-"""`[machine]` of either kind, by its `type`, which is BM1 if it is omitted."""
+"""`[machine]` of a BM1 or a BM2. The key `type` selects the kind. Its default is BM1."""
 
 
 class WrittenPrior(Section):
@@ -413,14 +413,14 @@ class WrittenPrior(Section):
 
 
 class FilterSection(Section):
-    """`[filter]`: the prior of a frame is predicted from the posterior of the frame before (`deployment.filter`)."""
+    """`[filter]`: a filter (`deployment.filter`) that predicts a frame's prior from the previous frame's posterior."""
 
     file: OwnPath = "filter.npy"
     hash: Sha256
 
 
 class BoardSection(Section):
-    """`[[board]]`: one board of the mini-cluster, its image and the lines of the machine that it computes."""
+    """`[[board]]`: a board of the mini-cluster, with its image and the lines that the board computes."""
 
     image: OwnPath
     image_hash: Sha256
@@ -450,7 +450,7 @@ class TopicsSection(Section):
 
 
 def parse_interface(text: str) -> tuple[int, int]:
-    """Return the counts of inputs and results in an interface such as `20x1200` (thesis 3.2), or raise a ValueError."""
+    """Return the numbers of inputs and results of an interface like `20x1200` (thesis 3.2), or raise a ValueError."""
     match = _INTERFACE.fullmatch(text)
     if not match:
         raise ValueError(f"{text!r} is not {_AN_INTERFACE}")

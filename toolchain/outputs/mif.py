@@ -27,7 +27,7 @@ MOST_WORDS: Final = 1 << 24
 """Maximum number of words in a memory. Without this limit, a short file could declare a memory of any depth."""
 
 MOST_WIDTH: Final = 1 << 20
-"""Maximum width of a word in bits: 4096 lines with the widest codes have 65,536."""
+"""Maximum width of a word in bits. 4096 lines with codes of 16 bits need words of 65,536 bits."""
 
 _BASES: Final = {"BIN": 2, "OCT": 8, "DEC": 10, "UNS": 10, "HEX": 16}
 _DECIMAL_DIGITS: Final = 4000  # Python refuses longer decimal numbers, because the time is quadratic
@@ -46,14 +46,14 @@ class Mif:
     width: int
     """Number of bits of a word."""
     words: tuple[int, ...]
-    """All words, from address 0; omitted addresses are 0, as in Quartus."""
+    """All words, from address 0. If the file omits an address, its word is 0, as in Quartus."""
 
 
 def mif_lines(width: int, depth: int, words: Iterable[int], comments: Iterable[str] = ()) -> Iterator[str]:
-    """Yield the lines of a file in canonical form: hexadecimal, with one entry per line.
+    """Yield the lines of a MIF in canonical form, with one hexadecimal entry per line.
 
-    `words` are all words from address 0, and `comments` are lines for the beginning, in which unprintable
-    characters are escaped.
+    `words` are all words from address 0. `comments` are comment lines for the beginning of the file. Unprintable
+    characters in comments are escaped.
     """
     for comment in comments:
         yield f"-- {printable(comment)}\n"
@@ -65,21 +65,21 @@ def mif_lines(width: int, depth: int, words: Iterable[int], comments: Iterable[s
 
 
 def printable(text: str) -> str:
-    """Return a name as one line of printable ASCII, for comments that all tools accept."""
+    """Escape a text to one line of printable ASCII, which all tools accept in comments."""
     return text.encode("unicode_escape").decode("ascii")
 
 
 def read_mif(path: Path, due: tuple[int, int] | None = None) -> Mif:
-    """Read the contents of a memory from any form of MIF; a MifError contains the line.
+    """Read the contents of a memory from any form of MIF. A MifError names the line.
 
-    With `due`, the expected width and depth, a memory of another size, or with a missing address, is refused.
+    `due` is the expected width and depth. With `due`, the file must have this size, and no address may be missing.
     """
     data = read_bounded(path, MOST_BYTES, MifError)
     return parse_mif(data.decode("latin-1"), str(path), due)
 
 
 def parse_mif(text: str, name: str = "the MIF", due: tuple[int, int] | None = None) -> Mif:
-    """Return the contents of a memory from the text of a MIF; a MifError contains the line and the expected token."""
+    """Return the contents of a memory from the text of a MIF. A MifError names the line and the expected token."""
     return _Reader(text, name, due).read()
 
 
@@ -238,19 +238,19 @@ def _short(word: str) -> str:
 
 
 LENGTH: Final = 1 << 16
-"""Length of a generated table of random numbers: a multiple of the number of codes at every width of codes."""
+"""Length of the table from `random_table`. It is a multiple of the number of codes at every width of codes."""
 
 
 def table_length(machine: BM1Machine | BM2Machine) -> int:
-    """Return the length of a machine's own table of random numbers, or of `random_table` if it has no table."""
+    """Return the length of the machine's table of random numbers, or `LENGTH` if the machine has no table."""
     return LENGTH if machine.rng_table is None else machine.rng_table.size
 
 
 def random_table(prob_bits: int) -> NDArray[np.uint32]:
-    """Return numbers of `prob_bits` bits in a random order, uint32[65536], all equally frequent.
+    """Return all numbers of `prob_bits` bits, equally often and in random order, uint32[65536].
 
-    The probability of every code is therefore exact over the whole table. The order is always the same, from
-    splitmix64.
+    Over the whole table, the probability of every code is therefore exact. The order comes from splitmix64, and is
+    always the same.
     """
     keys = mix(np.arange(1, LENGTH + 1, dtype=np.uint64) * np.uint64(GOLDEN))
     numbers: NDArray[np.uint32] = (np.argsort(keys, kind="stable") % (1 << prob_bits)).astype(np.uint32)
@@ -258,7 +258,10 @@ def random_table(prob_bits: int) -> NDArray[np.uint32]:
 
 
 def read_table(path: Path) -> NDArray[np.uint32]:
-    """Return the random numbers in a user's MIF, uint32[length], or raise a MifError or BuildError."""
+    """Return the random numbers in a user's MIF, uint32[length].
+
+    Raises a MifError if the file is invalid, or a BuildError if its words have more than 32 bits.
+    """
     mif = read_mif(path)
     if mif.width > 32:
         raise BuildError(
