@@ -1,6 +1,6 @@
 """Case studies, each with a model, a simulator or a data reader, and a page that describes it.
 
-This module has the flags that their commands have in common.
+This module defines the flags that the commands of several case studies have.
 """
 
 import random
@@ -34,7 +34,7 @@ Seed = Annotated[
 FirstTimeout = Annotated[float, typer.Option(min=0.1, help="Seconds until the first result.")]
 Timeout = Annotated[float, typer.Option(min=0.1, help="Seconds between two results.")]
 KEPT: Final = 2000
-"""Number of frames that a viewer keeps for its pictures and statistics if it runs until Ctrl-C."""
+"""If a viewer runs until Ctrl-C, it keeps this many frames, the newest, for its pictures and statistics."""
 Count = Annotated[
     int | None,
     typer.Option(

@@ -1,4 +1,4 @@
-"""Errors of this package; the text of each is one sentence for the user."""
+"""Errors of this package. The text of each error is one sentence for the user."""
 
 from typing import ClassVar
 

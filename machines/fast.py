@@ -38,20 +38,21 @@ from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset
 from machines.rng import LFSR, LFSRNumbers, Words, jump_tables
 
 KEPT_BYTES: Final = 64 * 2**20
-"""Maximum size in bytes of the cache of a machine's words; the operating system allocates only the part in use."""
+"""Maximum size in bytes of a machine's cache of words. The operating system allocates only the used part."""
 
 KEPT_CYCLES: Final = 2**17
-"""Number of cycles from the start of a frame for which the cells' words may be cached."""
+"""The words of at most this many cycles, counted from the start of a frame, are cached."""
 
 PREPARED_CYCLES: Final = 2**14
-"""Number of cycles from the start of a frame for which `prepare` computes the cells' words."""
+"""`prepare` computes the words of at most this many cycles, counted from the start of a frame."""
 
 
 class FastBM1(BM1Kernel):
     """A kernel for shared LFSRs that runs many cycles at a time (thesis 2.1.2 and 4.4).
 
-    The words of random bits are kept between frames (at most `kept_bytes`) if each frame restarts the generators from
-    a bank. Otherwise, or if not even one block of every bank fits, each frame computes its own words.
+    If each frame restarts the generators from a bank, a cache of at most `kept_bytes` bytes keeps the words of random
+    bits between frames. Without a restart, or if the cache is too small for a block of every bank, each frame computes
+    its own words.
 
     Raises:
         MachineError: The generators of the machine are not LFSRs, or are not shared.
@@ -94,7 +95,7 @@ class FastBM1(BM1Kernel):
 
     @property
     def counts(self) -> npt.NDArray[np.uint32]:
-        """A copy of the counters: uint32[lines], with several replicas uint32[replicas, lines]."""
+        """A copy of the counters: uint32[lines], or uint32[replicas, lines] if there are several replicas."""
         return self._frame.counts.reshape(self.machine.parameters.count_shape).copy()
 
     @property
@@ -106,11 +107,11 @@ class FastBM1(BM1Kernel):
 
     @property
     def kept_cycles(self) -> int:
-        """Number of first cycles of a frame, in each bank, for which the cache has room."""
+        """Number of cycles, counted from the start of a frame, for which the cache has room in each bank."""
         return 0 if self._of_frame else self._kept_blocks * BLOCK_CYCLES
 
     def prepare(self) -> None:
-        """Cache the words of the first `PREPARED_CYCLES` cycles of every bank, or of as many as fit the cache."""
+        """Cache the words of the first `PREPARED_CYCLES` cycles of every bank, or fewer if the cache is smaller."""
         blocks = min(self.kept_cycles, PREPARED_CYCLES) // BLOCK_CYCLES
         for bank in range(self.machine.parameters.rng_banks if blocks else 0):
             self._restart(bank)
@@ -203,7 +204,7 @@ class FastBM1(BM1Kernel):
 
 
 def warm_up() -> None:
-    """Compile the kernel, or load it from numba's cache on disk: about 5 s the first time, then 0.2 s."""
+    """Compile the kernel (about 5 s), or load it from numba's cache on disk (about 0.2 s)."""
     # with the generator that a build chooses by default, because its tables are then cached, too
     parameters = BM1Parameters(lines=1, sensor_bits=(), rng=RngKind.LFSR32)
     kernel = FastBM1(BM1Machine(parameters, np.full((1, 1), 128, dtype=np.uint16), ()))

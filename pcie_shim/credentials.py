@@ -40,7 +40,7 @@ def host_proof(key: bytes, board_nonce: bytes, host_nonce: bytes) -> bytes:
 
 
 def board_proof(key: bytes, board_nonce: bytes, host_nonce: bytes) -> bytes:
-    """Return the proof that a board has the key."""
+    """Return the proof that a board has the key: HMAC-SHA256 of both nonces."""
     return hmac.digest(key, _BOARD + board_nonce + host_nonce, hashlib.sha256)
 
 

@@ -1,4 +1,4 @@
-"""Signals that end a process, as an exception in blocking code and as cancellation of a coroutine."""
+"""Signals that end a process. They raise an exception in blocking code, and cancel a coroutine."""
 
 from __future__ import annotations
 
@@ -27,17 +27,18 @@ _received: list[int] = []
 
 
 def stopped_error(number: int) -> StoppedError:
-    """Return the error for a signal that ends a process, with exit code and sentence."""
+    """Return the error for a signal that ends a process. The error has the exit code and the sentence of the signal."""
     return StoppedError(*_ENDS[signal.Signals(number)])
 
 
 def raise_on_signals() -> None:
     """Make SIGINT, SIGTERM and SIGHUP raise `StoppedError` in the main thread.
 
-    A second signal is ignored, because the duration of the clean-up is bounded. Python drops an exception
-    that is raised while the thread runs a callback from C code, forks, or runs a finaliser. So code must call
-    `check_signals` before it blocks, as `run_async` does. C code may also print the exception and raise another
-    one in its place, as numba does while it is imported.
+    A second signal is ignored, because the clean-up after the first signal always ends within a limited time.
+
+    Code must call `check_signals` before it blocks, as `run_async` does. The reason is that the exception can be lost.
+    Python drops it while the thread runs a callback from C code, forks, or runs a finaliser. C code may also print it
+    and raise another exception instead, as numba does while it is imported.
     """
     sys.unraisablehook = _report_dropped
     sys.excepthook = _report_printed
@@ -64,18 +65,18 @@ def _report_printed(kind: type[BaseException], error: BaseException, traceback: 
 
 
 def received_stop() -> StoppedError | None:
-    """Return the error for the first signal that interrupted blocking code, or None."""
+    """Return the error for the first signal that interrupted blocking code, or None if no signal did."""
     return stopped_error(_received[0]) if _received else None
 
 
 def check_signals() -> None:
-    """Raise a StoppedError for a signal whose exception was dropped; call this before blocking."""
+    """Raise a StoppedError if a signal has arrived. Call this before blocking, because its first error may be lost."""
     if stop := received_stop():
         raise stop
 
 
 def ignore_signals() -> None:
-    """Ignore the signals that end a process, because it has finished its work."""
+    """Ignore the signals that end a process. Call this once the process has finished its work."""
     for number in _ENDS:
         signal.signal(number, signal.SIG_IGN)
 

@@ -1,7 +1,7 @@
 """Handles: the subscriptions, publications and services that a program has opened.
 
-A handle registers its operation (such as `subscribe`) with the session when it is created, and withdraws it when it is
-closed. Handles stay open when the connection is lost.
+When a handle is created, it registers an operation such as `subscribe` with the session. When the handle is closed, it
+withdraws the operation. Handles stay open when the connection is lost.
 """
 
 import asyncio
@@ -45,7 +45,7 @@ _log = logging.getLogger("bridge")
 
 
 class Handle:
-    """Base of handles. A handle is closed once: by `close`, at the end of its `async with`, or with its client."""
+    """Base class of handles. A handle is closed by `close`, at the end of an `async with` block, or with its client."""
 
     def __init__(self, session: Session) -> None:
         session.check_thread()
@@ -156,13 +156,13 @@ class Subscription(Handle):
         self.discarded += 1
 
     def leave_out(self, reason: str) -> None:
-        """Make the reader raise an error after the queued messages, because the topic is left out."""
+        """Record why the topic is left out. The reader gets the queued messages, and then a `TopicLeftOutError`."""
         _log.warning("%s %s", self.topic, reason)
         self._left_out = reason
         self._wake()
 
     def add_blind_seconds(self, seconds: float) -> None:
-        """Add the time without a connection to `blind_seconds`, after a reconnection."""
+        """After a reconnection, add the seconds without a connection to `blind_seconds`."""
         self.blind_seconds += min(seconds, time.monotonic() - self._begun)
 
     def __aiter__(self) -> Self:
@@ -359,12 +359,15 @@ class Publication(Handle):
         return not self._session.is_open or self._session.must_wait()
 
     async def ready(self, timeout: float = 5.0) -> None:
-        """Wait until the server has accepted all previous messages; errors as for `publish`."""
+        """Wait until the server has accepted all previous messages.
+
+        Raises a DisconnectedError if there is no connection, or a SlowPeerError after `timeout` seconds.
+        """
         if self._session.must_wait():
             await self._session.wait_turn(f"a message of {self.topic}", timeout)
 
     def publish_nowait(self, msg: Mapping[str, Any]) -> None:
-        """Send one message at once, or raise `SlowPeerError` instead of waiting. Otherwise like `publish`."""
+        """Send one message like `publish`, but raise a SlowPeerError if the message would have to wait."""
         session = self._session
         if session.must_wait():
             raise SlowPeerError(

@@ -43,19 +43,19 @@ from bridge.errors import (
 )
 
 FIRST_DELAY: Final = 0.1
-"""Delay in seconds before the first attempt to reconnect; it doubles up to `MAX_DELAY`."""
+"""Delay in seconds before the first attempt to reconnect. Each further delay is twice as long, up to `MAX_DELAY`."""
 MAX_DELAY: Final = 2.0
 ATTEMPT_TIMEOUT: Final = 5.0
 """Timeout in seconds of one attempt to reconnect."""
 STEADY: Final = 5.0
 """A connection that lasts this many seconds resets the delay of the next reconnection to `FIRST_DELAY`."""
 SILENCE: Final = 2.0
-"""Seconds after which a subscription that has had no message is checked."""
+"""A subscription is checked if it has had no message after this many seconds."""
 LONGEST_SILENCE: Final = 30.0
 """Maximum delay in seconds between two checks of silent subscriptions. The delay begins at `SILENCE` and doubles."""
 _ROSAPI_TIMEOUT: Final = 1.0
 KEPT_STATUSES: Final = 16
-"""Number of status messages of the server that are stored."""
+"""Maximum number of stored status messages of the server."""
 # Number of messages sent in a row before other tasks get their turn.
 _LONGEST_BURST: Final = 32
 
@@ -88,14 +88,14 @@ class Reader(Protocol):
         """Count a message that was discarded because it is larger than `max_bytes`."""
 
     def leave_out(self, reason: str) -> None:
-        """Make reading raise an error, because the topic is left out: its messages are too large."""
+        """Record that the topic is left out, because a message was too large. Reading then raises an error."""
 
     def add_blind_seconds(self, seconds: float) -> None:
-        """Add the time without a connection to `blind_seconds`, after a reconnection."""
+        """After a reconnection, add the seconds without a connection to `blind_seconds`."""
 
 
 class GoalReceiver(Protocol):
-    """Receiver of the events of one goal of this client."""
+    """Receiver of the events of one goal that this client has sent."""
 
     def receive(self, event: GoalFeedback | GoalEnded) -> None:
         """Handle an event of the goal."""
@@ -108,22 +108,23 @@ class GoalExecutor(Protocol):
     """Receiver of the goals of one action that this client serves."""
 
     def receive(self, event: GoalRequested | CancelRequested) -> None:
-        """Start a goal, or ask to cancel it."""
+        """Start a requested goal, or cancel a running goal."""
 
     def lost(self) -> None:
-        """Give up the goals of a lost connection."""
+        """Give up all goals, because the connection is lost."""
 
 
 class Session:
     """The connection of a client, over its successive WebSockets.
 
-    It owns the clocks and the socket, and moves bytes between the socket and `core`, which interprets them:
+    The session owns the timers and the socket. It moves bytes between the socket and `core`, and `core` interprets
+    the bytes:
 
         handle  ->  core  ->  flush  ->  WebSocket  ->  server
         handle  <-  _take  <-  core  <-  WebSocket  <-  server
 
-    A published message does not pass through the core's outbox: the core encodes it, and the session writes it to the
-    socket at once. Everything runs in the thread of the event loop, so state changes only at an `await`.
+    Published messages do not wait in the core's outbox: the core encodes them, and the session writes them to the
+    socket at once. All code runs in the thread of the event loop, so state changes only at an `await`.
     """
 
     def __init__(
@@ -242,7 +243,7 @@ class Session:
                 return
 
     async def close(self, reason: str = "closed by this client") -> None:
-        """Close the connection once all sent messages are written, and end every wait for a message or an answer."""
+        """End every wait for a message or an answer. Close the connection once all sent messages are written."""
         self.check_thread()
         if self.state is State.CLOSED:
             return
@@ -335,14 +336,14 @@ class Session:
         return f"; the largest so far was one of {largest}, with {size} bytes" if size else ""
 
     def why_left_out(self) -> str:
-        """Return the last part of the error text for a topic that is left out after a message exceeded `max_size`."""
+        """Return the end of an error text: the topic is left out, because one of its messages exceeded `max_size`."""
         return (
             f"is left out: a message of it has more than the {self.core.wire.max_size} bytes (max_size) that this "
             f"client of {self.uri} accepts"
         )
 
     def reconnect_now(self) -> None:
-        """Do not wait before the next attempt to reconnect, if the connection is lost."""
+        """If the connection is lost, make the next attempt to reconnect at once."""
         self.check_thread()
         self._delay = FIRST_DELAY
         if self._pause is not None:
@@ -453,7 +454,7 @@ class Session:
             self._largest_sent = len(data)
 
     def should_yield(self) -> bool:
-        """Count a sent message, and return whether other tasks should get their turn."""
+        """Count a sent message. Return whether the caller should now yield to other tasks."""
         self._burst += 1
         if self._burst < _LONGEST_BURST:
             return False
@@ -461,13 +462,13 @@ class Session:
         return True
 
     def together(self) -> AbstractContextManager[None]:
-        """Write everything sent inside the block at once (see `bridge.client.Ros.together`)."""
+        """Return a context that sends all messages of its block together (see `bridge.client.Ros.together`)."""
         self.check_thread()
         websocket = self._websocket
         return nullcontext() if websocket is None else websocket.together()
 
     async def wait_turn(self, what: str, limit: float) -> None:
-        """Wait until the server has accepted all previous messages; `what` names the message in errors."""
+        """Wait until the server has accepted all previous messages. The text of an error calls the message `what`."""
         self._waiting += 1
         try:
             async with asyncio.timeout(limit), self._turn:
@@ -487,7 +488,7 @@ class Session:
                 websocket.count_unread(len(message))
 
     def watch_silence(self) -> None:
-        """Check for silent subscriptions from now on, until all have had a message on this connection."""
+        """Start to check for silent subscriptions. The checks end once each has had a message on this connection."""
         self._renewal_delay = SILENCE
         if self._websocket is not None:
             self._schedule_renewal()

@@ -1,7 +1,7 @@
 """Definitions of services, actions and messages that `rosbags` does not have, in ROS's own notation.
 
-Clients of rosbridge use these most: the services of `std_srvs` and of rosapi, the actions of the tutorials, and
-`tf2_msgs`. Sources: the packages' own `.srv`, `.action` and `.msg` files.
+The module has only the definitions that rosbridge clients use most: the services of `std_srvs` and of rosapi, the
+actions of the ROS tutorials, and `tf2_msgs`. The sources are the packages' own `.srv`, `.action` and `.msg` files.
 """
 
 from functools import cache
@@ -171,7 +171,10 @@ def part_name(type_name: str, part: str, ros_version: RosVersion) -> str:
 
 @cache
 def message_texts(ros_version: RosVersion) -> dict[str, str]:
-    """Return message definitions by name in ROS 2's form, including the parts of services and actions."""
+    """Return message definitions by message name, including the parts of services and actions.
+
+    The names always have the form of ROS 2, such as `tf2_msgs/msg/TFMessage`.
+    """
     rosapi = "rosapi_msgs" if ros_version == 2 else "rosapi"
     own = _ROSAPI | (_ROSAPI_2 if ros_version == 2 else {})
     services = _SERVICES | {f"{rosapi}/{name}": text for name, text in own.items()}

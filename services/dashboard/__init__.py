@@ -1,1 +1,1 @@
-"""The page in the browser. It only reads public topics and status sockets; no service imports it."""
+"""The dashboard, a page in the browser. It gets its data from public topics and status sockets."""

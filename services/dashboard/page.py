@@ -37,7 +37,7 @@ _MAX_ASKING: Final = 8
 
 
 class Live(Element, component="live.js"):
-    """The moving part of the page, which `live.js` draws."""
+    """The part of the page that changes with each frame. The script `live.js` draws it."""
 
     def __init__(self, view: str) -> None:
         super().__init__()
@@ -45,7 +45,7 @@ class Live(Element, component="live.js"):
 
 
 class Wish(msgspec.Struct, frozen=True):
-    """A request from a browser: a new place for the simulated boat, or the setting of a switch."""
+    """A request from a browser: to move the simulated boat to `pose`, or to turn a switch on or off."""
 
     pose: tuple[float, float] | None = None
     switch: str = ""

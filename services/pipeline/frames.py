@@ -1,6 +1,6 @@
 """Assembly of complete readings from the messages of one or several topics.
 
-It has no sockets: messages go in, complete sets of addresses come out.
+The module has no sockets. It takes messages, and returns complete readings.
 """
 
 import math
@@ -20,7 +20,7 @@ from toolchain.deployment.address import to_address
 from toolchain.errors import ReadingError, ReadingMissingError
 
 UNPAIRED_WARNING = 8
-"""If every needed topic has this many unpaired messages, a gap between their stamps is reported."""
+"""If every needed topic has had this many messages since the last frame, the gap between their stamps is reported."""
 
 
 class _SourceReader:
@@ -116,10 +116,10 @@ def _plain(value: object) -> float | str | None:
 
 @dataclass(frozen=True, slots=True)
 class StampGap:
-    """A gap between the stamps of topics that exceeds the tolerance, so that no frames are formed."""
+    """A gap between the stamps of two topics. The gap exceeds the tolerance, so no frame is formed."""
 
     oldest: str
-    """The topic whose newest stamp is older than those of the other topics."""
+    """The topic with the oldest last message, by stamp. `newest` is the topic with the newest last message."""
     newest: str
     apart_s: float
     tolerance_s: float
@@ -140,8 +140,8 @@ class StampGap:
 class FrameAssembler:
     """Assembly of complete readings from the messages of a deployment's topics.
 
-    With one topic, every message is a frame. With several, messages are paired by stamp (see `Synchroniser`),
-    and unpaired messages are counted in `unpaired`. The clock of a simulation replaces the times of receipt.
+    With one topic, every message is a frame. With several topics, messages are paired by their stamps (see
+    `Synchroniser`). If the clock is simulated, the simulated time is used instead of the times of receipt.
     """
 
     def __init__(self, deployment: Deployment, clock: Clock | None = None) -> None:
@@ -167,7 +167,7 @@ class FrameAssembler:
 
     @property
     def deadline(self) -> int | None:
-        """Tick (ns) at which to call `due` if no message completes the reading earlier; None if no message waits."""
+        """Tick (ns) at which the caller must call `due`, or None if no message waits for another topic."""
         return self._synchroniser.deadline
 
     def take(
@@ -240,11 +240,11 @@ class FrameAssembler:
         )
 
     def needs(self, source: int) -> bool:
-        """Return whether every frame needs a message of the source with this index."""
+        """Return whether each frame must have a message of this source (an index)."""
         return self._readers[source].needed
 
     def stamp_gap(self) -> StampGap | None:
-        """Return the gap between stamps if it prevents frames although all needed topics have messages."""
+        """Return the gap between stamps if all needed topics have messages but no frame is formed, otherwise None."""
         needed = [source for source, reader in enumerate(self._readers) if reader.needed]
         if len(needed) < 2 or any(self._since_pair[source] < UNPAIRED_WARNING for source in needed):
             return None

@@ -3,8 +3,8 @@
     master ──FrameRequest──▶ posted ──the last board is done──────▶ FrameResult ──▶ master
                         └──a board fails──▶ lost boards are found ──▶ FrameFailed ──▶ master
 
-One frame is on the boards at a time. Slow work (opening boards, finding lost ones, recovering them) runs in a
-thread, and no frame is posted meanwhile.
+At most one frame is on the boards at a time. A thread opens boards, finds lost boards and recovers lost boards. During
+this slow work, no frame is posted.
 """
 
 import asyncio
@@ -28,7 +28,7 @@ Result = TypeVar("Result")
 
 
 class PcieApp(RunService):
-    """Service that computes the frames of a master."""
+    """The service that computes a master's frames on the boards."""
 
     role = ROLE
 

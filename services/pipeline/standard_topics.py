@@ -3,7 +3,8 @@
     publish_now ──▶ offer ──next turn of the loop, or a timer──▶ _send ──▶ /bm/counts, /bm/posterior, /bm/pose, /bm/decision
     status sockets ──once a second──▶ keep_reporting ──────────▶ /diagnostics
 
-A result never waits for them: only the newest frame is kept, and a fault only causes a warning.
+A result never waits for a message on these topics. If frames come too fast, only the newest frame is sent. An error
+only causes a warning.
 """
 
 import asyncio
@@ -37,7 +38,7 @@ from terminal.logs import get_logger
 from toolchain.deployment import Deployment
 
 INTERVAL: Final = 0.1
-"""Minimum number of seconds between two messages of a topic, because the hub's work for them delays readings."""
+"""Minimum number of seconds between two messages of a topic. Each message is work for the hub and delays readings."""
 _HEALTH_INTERVAL: Final = 1.0
 
 _TYPES: Final = {
@@ -114,7 +115,7 @@ class StandardTopics:
             yield key
 
     def offer(self, publish: Publish, inference: Inference) -> None:
-        """Send the messages of a frame later, unless a newer frame replaces it before."""
+        """Schedule the messages of a frame. A newer frame replaces a frame whose messages have not been sent yet."""
         self._last, self._waiting = (publish, inference, self._clock.tick()), True
         if self._timer is None and self._publications:
             loop = asyncio.get_running_loop()
@@ -122,7 +123,7 @@ class StandardTopics:
             self._timer = loop.call_soon(self._send) if wait <= 0 else loop.call_later(wait, self._send)
 
     def flush(self) -> None:
-        """Send a waiting frame and the health at once, because the run is about to end."""
+        """Before the run ends, send a waiting frame and the health of boards and services at once."""
         if self._timer is not None:
             self._timer.cancel()
         self._send()

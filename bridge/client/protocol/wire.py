@@ -1,4 +1,4 @@
-"""The outbox of a client: whole messages in order, while there is a connection."""
+"""The outbox of a client: complete messages in order. Without a connection, it drops messages."""
 
 from collections.abc import Callable
 from itertools import count
@@ -8,11 +8,11 @@ from bridge.codecs.json_codec import encode
 from bridge.names import Kind, RosVersion, ros1_type, ros2_type
 
 SMALLEST_LIMIT: Final = 2048
-"""Minimum in bytes for a server's size limit: smaller ones count as this, so that subscriptions can always be sent."""
+"""If the size limit of a server is below this many bytes, the client uses this value, so that it can subscribe."""
 
 
 class Wire:
-    """The outbox for all parts of a client's core, and the properties of the connection that they share."""
+    """The outbox and the properties of the connection, for all parts of a client's core."""
 
     def __init__(self, *, ros_version: RosVersion | None, max_size: int, max_depth: int) -> None:
         self._outbox: list[bytes] = []
@@ -29,9 +29,9 @@ class Wire:
         self.sendable = max_size
 
     def type_name(self, name: str, kind: Kind = "msg") -> str:
-        """Return a type name in the form of the server's ROS version; while that is unknown, in the form of ROS 1.
+        """Return a type name in the form of the server's ROS version.
 
-        All servers accept the form of ROS 1.
+        While the version is unknown, the name has the form of ROS 1, because all servers accept this form.
         """
         return ros2_type(name, kind) if self.ros_version == 2 else ros1_type(name)
 
@@ -40,7 +40,7 @@ class Wire:
         self.write_bytes(encode(operation, max_size=self.sendable, max_depth=self.max_depth))
 
     def limit(self, size: int) -> None:
-        """From now on, refuse to send messages of more than `size` bytes."""
+        """Lower the maximum size of outbound messages to `size` bytes, but not below `SMALLEST_LIMIT`."""
         self.sendable = min(self.sendable, max(size, SMALLEST_LIMIT))
 
     def write_bytes(self, data: bytes) -> None:
