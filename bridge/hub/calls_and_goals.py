@@ -218,7 +218,7 @@ class Calls(_Exchange):
         rosapi: Rosapi,
         answer_here: Callable[[Client, str], dict[str, Any] | None],
     ) -> None:
-        """Start without services. `answer_here` answers a service of the hub itself, or returns None for another name."""
+        """Start without services. `answer_here` answers services of the hub itself, and returns None for others."""
         super().__init__(limits, dispatcher, definitions, graph.services, lambda client: client.services)
         self._graph = graph
         self._rosapi = rosapi

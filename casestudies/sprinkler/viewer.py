@@ -1,4 +1,4 @@
-"""Viewer of the samples that a BM2 publishes for the sprinkler: estimates of P(R | G) from them, and a picture."""
+"""Viewer of a BM2's samples for the sprinkler. It prints and draws estimates of P(R | G) from the samples."""
 
 import math
 from collections import deque
@@ -45,19 +45,19 @@ class FrameSummary:
 
     number: int
     grass: int
-    """The value of G in this frame: 0 for dry, 1 for wet grass."""
+    """The value of G in this frame: 0 for dry grass, 1 for wet grass."""
     share: float
     """P(R = 1) in the posterior on `/BMresults`."""
     error: float
-    """Standard error of `share`, from `/bm/frame`. If the report has no standard error, this is 0.5, the maximum."""
+    """Standard error of `share`, from `/bm/frame`. If the report lacks it, the value is 0.5, the maximum."""
     effective: float
-    """Number of effective samples, from `/bm/frame`. If the report has no such number, this is 1."""
+    """Number of effective samples, from `/bm/frame`. If the report lacks it, the value is 1."""
     curve: NDArray[np.int64]
-    """int64[points, 2]: a number n, and how many of the first n samples have R = 1. The last n counts all samples."""
+    """int64[points, 2]: a number n, and how many of the first n samples have R = 1. The last n is the total."""
 
 
 def frame_of(posterior: Posterior, samples: NDArray[np.int64]) -> FrameSummary:
-    """Summarise a frame's posterior and samples, int64[samples, variables]."""
+    """Return the summary of a frame from its posterior and its samples, int64[samples, variables]."""
     rained = np.cumsum(samples[:, _R])
     at = np.unique(np.geomspace(1, len(samples), _POINTS).astype(np.int64))
     details = posterior.report.details if posterior.report else {}
@@ -72,13 +72,13 @@ def frame_of(posterior: Posterior, samples: NDArray[np.int64]) -> FrameSummary:
 
 
 def mean_and_error(frames: Sequence[FrameSummary]) -> tuple[float, float]:
-    """Return the mean P(R = 1) of at least one frame, and the standard error of this mean."""
+    """Return the mean of P(R = 1) over one or more frames, and the standard error of the mean."""
     mean = math.fsum(frame.share for frame in frames) / len(frames)
     return mean, math.sqrt(math.fsum(frame.error**2 for frame in frames)) / len(frames)
 
 
 def draw(path: Path, frames: Sequence[FrameSummary]) -> None:
-    """Draw each frame's estimate against the number of samples, and the exact P(R = 1), or raise an OutputError."""
+    """Draw estimates of P(R = 1 | G) against the number of samples, and the exact value, or raise an OutputError."""
     figure = new_figure(8, 4.6)
     axes = figure.subplots()
     for grass, (name, colour) in enumerate(zip(GRASS, _COLOURS, strict=True)):
@@ -114,7 +114,7 @@ class SamplesViewer:
     """
 
     def __init__(self, count: int | None) -> None:
-        """Start without frames; `count` is the number of results to wait for, None to run until Ctrl-C."""
+        """Start without frames. `count` is the number of results to wait for. If it is None, watch until Ctrl-C."""
         self.frames: deque[FrameSummary] = deque(maxlen=KEPT if count is None else None)
         self.results = 0
         self._count = count
@@ -122,7 +122,7 @@ class SamplesViewer:
         self._unclaimed: list[NDArray[np.int64]] = []  # without a frame yet, in the order of arrival
 
     async def watch(self, uri: str, *, first_limit_s: float, limit_s: float) -> None:
-        """Listen until all results have arrived, and print a line for each.
+        """Listen until the number of results to wait for has arrived, and print a line for each result.
 
         Raises:
             NoResultError: No result, or no samples, came in time.
@@ -142,7 +142,7 @@ class SamplesViewer:
                 readiness.record()
 
     def add(self, posterior: Posterior, samples: NDArray[np.int64] | None) -> None:
-        """Add a result with its samples, None if they are lost, and print its line."""
+        """Add a result with its samples, and print a line. If the samples are lost (None), print a warning instead."""
         self.results += 1
         if samples is None:
             warn(f"the samples of frame {posterior.number} are lost; the estimate is made without it")

@@ -1,4 +1,4 @@
-"""A run of the master: its peers, the flow of frames between them, and the end."""
+"""A run of the master: the start of its peers, the flow of frames between the peers, and the end."""
 
 import asyncio
 import contextlib
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from services.output.posterior_output import Show
 
 ASK_EVERY = 5.0
-"""Seconds between two checks whether all children make progress."""
+"""Seconds between two checks of whether all children make progress."""
 _ANSWER_TIME = 2.0
 _LOCK_EVERY = 0.05
 _PROGRESS_EVERY = 1.0
@@ -44,7 +44,7 @@ _GRACE_PERIOD = 2.0
 
 
 class Master:
-    """A run with a deployment: for one frame, or until it ends. Create it inside the event loop that runs it."""
+    """A run of the master with one deployment. Create it inside the event loop that executes `run`."""
 
     def __init__(
         self,
@@ -82,7 +82,7 @@ class Master:
         self._tasks: list[asyncio.Task[None]] = []
 
     async def run(self) -> int:
-        """Start missing peers, move frames, and stop the started peers; raise a StackError for an error of the run."""
+        """Start missing peers, pass frames between them, and stop the started peers, or raise a StackError."""
         settings, peers = self._settings, self._peers
         sockets = contextlib.AsyncExitStack()
         try:
@@ -267,14 +267,14 @@ class Master:
 
 
 class ChildrenWatch:
-    """The progress of the processes that a master started, according to their status sockets.
+    """Regular queries of the status sockets of the processes that a master started.
 
-    Without this watch, a child that is stopped or stuck while it has no work would go unnoticed. Children that are
-    being restarted are ignored.
+    Without the queries, the master would not notice that a child without work is stopped or stuck. Children that are
+    being restarted are not queried.
     """
 
     def __init__(self, peers: Iterable[Peer], directory: Path) -> None:
-        """Store the services of the master, and the directory of their sockets."""
+        """Store the peers of the master, and the directory of the peers' status sockets."""
         self._peers = peers
         self._directory = directory
         # When all of them last answered (monotonic, s). At first they have as long to start.

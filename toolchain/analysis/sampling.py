@@ -1,4 +1,4 @@
-"""Runs of a BM2 on drawn readings, compared with exact inference, and its resources on an FPGA."""
+"""Runs of a BM2 on drawn readings, compared with exact inference, and estimates of a BM2's FPGA resources."""
 
 import math
 from collections import Counter
@@ -38,11 +38,11 @@ from toolchain.outputs.mif import table_length
 _INFINITE: Final = 1e9
 _SEQUENCER_BITS: Final = 16  # the sequencer has an LFSR16 of its own, and seeds for it
 Addresses = tuple[int, ...]
-"""A frame's readings: an address per known variable."""
+"""A frame's readings, one address for each known variable."""
 
 
 def drawn_readings(model: NetworkModel, frames: int, seed: int) -> list[Addresses]:
-    """Draw readings of all known variables from the model, each conditioned on the variables drawn before it."""
+    """Draw readings of all known variables for each frame. Each variable is drawn given those drawn before it."""
     check_frames(frames)
     random = np.random.default_rng(seed)
     given_earlier = [
@@ -133,7 +133,7 @@ def run_chains(
     advance: Callable[[], None] = lambda: None,
     run: Run = in_this_process,
 ) -> Sampled:
-    """Run every reading on boards with these machines; a BuildError if no reading gets a posterior."""
+    """Run every reading on boards with these machines. Raises a BuildError if no reading gets a posterior."""
     p = machines[0].parameters
     if p.rng_reset is RngReset.FREE:
         run = in_this_process  # the generators run on from frame to frame
@@ -163,7 +163,7 @@ def run_chains(
 
 
 def chain_resources(machine: BM2Machine, device: Device) -> Estimate:
-    """Return the resources of a board, estimated from the units of a BM1, because there is no VHDL of a BM2."""
+    """Estimate the FPGA resources of a board from the parts of a BM1, because there is no VHDL of a BM2."""
     p = machine.parameters
     seed, adders = seed_width(machine), len([bits for bits in p.bits if bits]) + 1
     # each bit of a CDE's factor moves by one place in the address if the pointer is below it

@@ -42,12 +42,12 @@ _ROUNDING: Final = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class JointDistribution:
-    """A product of factors: a Bayesian network or, with potentials, a Markov network."""
+    """A product of factors. It is a Bayesian network or, if a factor is a potential, a Markov network."""
 
     name: str
     """The name of the model in deployments."""
     factors: tuple[Factor, ...]
-    """The distributions P(A | B, C) and the potentials. Parents such as B and C have a factor of their own."""
+    """Distributions such as P(A | B, C), and potentials. Parents such as B and C have factors of their own."""
     symbols: tuple[Symbol, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -84,7 +84,7 @@ class JointDistribution:
         return tuple(map(without_idle, self.factors))
 
     def symbol(self, name: Named) -> Symbol:
-        """Return a symbol by its name, or raise a ModelError."""
+        """Return the symbol with this name, or raise a ModelError."""
         wanted = name if isinstance(name, str) else name.name
         for symbol in self.symbols:
             if symbol.name == wanted:
@@ -150,11 +150,11 @@ class Question:
     known: tuple[Symbol, ...]
     """The known symbols, in the columns' order."""
     given: Mapping[str, int]
-    """For each symbol that the question fixes, by name, the index of its value."""
+    """The index of each fixed symbol's value, by the name of the symbol."""
     prior_select: Symbol | None
     """The symbol that selects the prior, or None."""
     previous: tuple[Symbol, ...] = ()
-    """The searched symbols one frame earlier, for a filter; or none."""
+    """For a filter, the symbols of the previous frame, in the order of `searched`. Otherwise empty."""
 
     def __repr__(self) -> str:
         known = [*(each.name for each in self.observed), *(f"{name}={at}" for name, at in self.given.items())]
@@ -267,14 +267,14 @@ class Question:
                         )
 
     def network(self) -> NetworkModel:
-        """Return the network that a BM2 samples, or raise a ModelError; `prior_select` becomes a known symbol."""
+        """Return the network that a BM2 samples, or raise a ModelError. `prior_select` is one of its known symbols."""
         joint = self.joint
         return network_model(
             joint.name, joint.factors, joint.symbols, self.searched, self.observed, self.given
         )
 
     def refusal(self) -> NotFusionError | None:
-        """Return why the question is not a naive fusion, or None if it is one."""
+        """Return an error that says why the question is not naive fusion, or None if the question is naive fusion."""
         observed = [symbol.name for symbol in self.observed]
         _, links = self._linked(self.joint.active, observed)
         if any(len(component.intersection(observed)) > 1 for component in links.components()):
@@ -282,7 +282,10 @@ class Question:
         return None
 
     def dependent(self) -> list[tuple[str, str]]:
-        """Return the pairs of known symbols that are dependent given the searched ones; a BM1 can know one of each."""
+        """Return the pairs of known symbols that are dependent given the searched symbols.
+
+        A BM1 can know only one symbol of a pair.
+        """
         factors, pairs = self._pairs()
         return [
             (one, other) for _, one, other in pairs if self._linked(factors, [one, other])[1].path(one, other)

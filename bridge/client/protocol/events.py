@@ -1,4 +1,4 @@
-"""Events of the protocol core: decoded messages of the server."""
+"""Events that the client's protocol core makes from messages of the server."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -40,7 +40,7 @@ class Message(NamedTuple):
 
 
 class MessageReceived(NamedTuple):
-    """A message, and the subscriptions that get it, by the numbers from `Subscriptions.subscribe`."""
+    """A message of a topic, and the numbers (from `Subscriptions.subscribe`) of the subscriptions that receive it."""
 
     topic: str
     msg: dict[str, Any]
@@ -63,7 +63,7 @@ class MessageDiscarded:
 
 @dataclass(frozen=True, slots=True)
 class CallAnswered:
-    """The answer of a service: its values, or the text of its refusal."""
+    """The answer to a service call. If `ok` is False, `values` is the text of the failure."""
 
     call: str
     ok: bool
@@ -72,7 +72,7 @@ class CallAnswered:
 
 @dataclass(frozen=True, slots=True)
 class ServiceRequested:
-    """A request to a service of this client; pass its ticket to `ServedServices.answer`."""
+    """A request to a service of this client. To answer the request, pass `ticket` to `ServedServices.answer`."""
 
     service: str
     args: dict[str, Any]
@@ -81,12 +81,12 @@ class ServiceRequested:
 
 @dataclass(frozen=True, slots=True)
 class StatusReceived:
-    """A status message about an operation (few servers send them)."""
+    """A status message about an operation. Few servers send status messages."""
 
     level: str
     text: str
     operation: str = ""
-    """The id of the operation, if the server repeats it."""
+    """The id of the operation, or empty if the server does not send the id."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,7 +118,7 @@ class GoalFeedback:
 
 @dataclass(frozen=True, slots=True)
 class GoalEnded:
-    """The end of a goal that this client sent: its status and result, or the text of the failure."""
+    """The end of a goal that this client sent. `values` is the result or, if `ok` is False, the text of the failure."""
 
     goal: str
     ok: bool
@@ -128,7 +128,7 @@ class GoalEnded:
 
 @dataclass(frozen=True, slots=True)
 class GoalRequested:
-    """A goal for an action of this client."""
+    """A goal sent to an action of this client."""
 
     action: str
     goal: str
@@ -137,7 +137,7 @@ class GoalRequested:
 
 @dataclass(frozen=True, slots=True)
 class CancelRequested:
-    """The sender of a goal has cancelled it."""
+    """The sender of a goal to an action of this client has cancelled the goal."""
 
     action: str
     goal: str
