@@ -35,11 +35,11 @@ from bridge.qos import Qos
 DETECT_TIMEOUT: Final = 2.0
 """Timeout in seconds for detecting the ROS version of the server."""
 FAREWELL_TIMEOUT: Final = 0.3
-"""Maximum wait in seconds, before disconnecting, until the server has read everything."""
+"""Maximum number of seconds for which `close` waits until the server has read all messages."""
 
 
 class Ros:
-    """A client of one rosbridge server, created by `connect`, and opened and closed once by `async with`."""
+    """A client of one rosbridge server. `connect` creates the client, and `async with` opens and closes it once."""
 
     def __init__(self, session: Session, *, check_types: bool = True) -> None:
         self._session = session
@@ -94,12 +94,12 @@ class Ros:
         return self._session.reconnections
 
     def reconnect_now(self) -> None:
-        """Try at once to reach a lost server, for example when another program has just reached it."""
+        """Try to reconnect now instead of at the next regular attempt, for example if another program could connect."""
         self._session.reconnect_now()
 
     @property
     def last_error(self) -> str:
-        """Reason of the lost connection, or of the last failed attempt to reconnect; empty if there is none."""
+        """Reason of the latest connection loss or failed attempt to connect, or "" if there was none."""
         return self._session.last_error
 
     @property
@@ -388,11 +388,11 @@ class Ros:
         return await self._ask_type(timeout, "topic_type", topic=topic)
 
     async def topics(self, timeout: float = 1.0) -> list[str] | None:
-        """Return the names of all topics at the server; None without rosapi."""
+        """Return the names of all topics at the server, or None if the server has no rosapi."""
         return await self._ask_names(timeout, "topics")
 
     async def publishers(self, topic: str, timeout: float = 1.0) -> list[str] | None:
-        """Return the names of the nodes that publish a topic; None without rosapi."""
+        """Return the names of the nodes that publish a topic, or None if the server has no rosapi."""
         return await self._ask_names(timeout, "publishers", topic=topic)
 
     async def message_details(self, type: str, timeout: float = 1.0) -> Definitions:
@@ -404,7 +404,7 @@ class Ros:
         return definitions_from_rosapi(await self._session.ask_rosapi("message_details", args, timeout))
 
     async def services(self, timeout: float = 1.0) -> list[str] | None:
-        """Return the names of all services; None without rosapi."""
+        """Return the names of all services, or None if the server has no rosapi."""
         return await self._ask_names(timeout, "services")
 
     async def service_type(self, service: str, timeout: float = 1.0) -> str | None:

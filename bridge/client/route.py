@@ -32,7 +32,7 @@ _ConnectionT = TypeVar("_ConnectionT", bound=asyncio.Protocol)
 
 
 def shown(uri: str) -> str:
-    """Return a URI without user, password and query."""
+    """Return a URI without user and password, and with `***` instead of the query."""
     return _QUERY.sub("?***", _CREDENTIALS.sub(r"\1", uri))
 
 
@@ -103,7 +103,10 @@ def _tls(uri: WebSocketURI, ca_file: Path | None, tls: ssl.SSLContext | None) ->
 
 
 async def connect_along(route: Route, uri: WebSocketURI, factory: Callable[[], _ConnectionT]) -> _ConnectionT:
-    """Connect to the first of a host's addresses that accepts; if none does, raise the OSError of the last."""
+    """Connect to the first address of the host that accepts the connection.
+
+    Raises the OSError of the last address if no address accepts the connection. An SSLError is raised at once.
+    """
     loop = asyncio.get_running_loop()
     # not by `create_connection`, in which uvloop reports a look-up that fails after the attempt has timed out
     found: list[Any] = await loop.getaddrinfo(uri.host, uri.port, type=SOCK_STREAM)
@@ -130,7 +133,7 @@ def _is_loopback(host: str) -> bool:
 
 
 def reason_of(error: Exception) -> str:
-    """Return the text of an error, without the `[Errno ...]` before it."""
+    """Return the reason of an error as text, without a prefix `[Errno ...]`."""
     match error:
         case ConnectionRefusedError():
             return "connection refused"

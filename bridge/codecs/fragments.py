@@ -27,13 +27,13 @@ from bridge.codecs.json_codec import MAX_SIZE
 from bridge.errors import DecodeError
 
 MAX_SETS: Final = 16
-"""Maximum number of incomplete messages; a new one replaces the oldest."""
+"""Maximum number of incomplete messages of a connection. A further message replaces the oldest."""
 MAX_FRAGMENTS: Final = 1 << 16
 """Maximum number of fragments in a message."""
 MAX_AGE: Final = 10.0
-"""Seconds without another fragment after which a message is discarded."""
+"""An incomplete message is discarded if no fragment of it arrives for this many seconds."""
 OVERHEAD: Final = 128
-"""Bytes that are added to the size of each stored fragment, so that empty fragments count too."""
+"""Number of bytes added to the size of each stored fragment, so that empty fragments count too."""
 _LONGEST_ID: Final = 1024
 # Value and mask of UTF-8 bytes inside a character.
 _CONTINUATION: Final = 0x80, 0xC0
@@ -62,13 +62,13 @@ class _Set:
 
 
 class Reassembler:
-    """Reassembly of the messages of one connection; callers pass the present time."""
+    """Reassembly of the fragmented messages of one connection. Callers pass the current time."""
 
     def __init__(self, *, max_size: int = MAX_SIZE) -> None:
         """Start without fragments.
 
-        `max_size` is the maximum size of a complete message in bytes; all incomplete messages together may
-        occupy four times as much, including overhead.
+        `max_size` is the maximum size of a complete message in bytes. All incomplete messages together may occupy
+        four times as many bytes, with `OVERHEAD` for each fragment.
         """
         self.waiting_bytes = 0
         """Number of bytes that all incomplete messages occupy, with `OVERHEAD` for each fragment."""
@@ -81,7 +81,7 @@ class Reassembler:
 
     @property
     def deadline(self) -> float:
-        """Time at which to call `expire`; infinity for never."""
+        """Time at which to call `expire`, or infinity if no message is incomplete."""
         return min((begun.touched for begun in self._sets.values()), default=math.inf) + MAX_AGE
 
     def take(self, fragment: Mapping[str, Any], now: float) -> bytes | None:
@@ -126,7 +126,7 @@ class Reassembler:
         return None
 
     def expire(self, now: float) -> None:
-        """Discard the messages that have waited too long for a fragment."""
+        """Discard each message that has not received a fragment for `MAX_AGE` seconds at the time `now`."""
         for key in [key for key, begun in self._sets.items() if begun.touched + MAX_AGE <= now]:
             self._forget(key)
 
@@ -156,11 +156,12 @@ class Reassembler:
 
 
 def split(message: bytes, fragment_size: int, fragment_id: FragmentId) -> Iterator[bytes]:
-    """Split the JSON of an operation into fragments of at most `fragment_size` bytes, but at least one character.
+    """Split the JSON of an operation into fragments.
+
+    Each fragment contains at most `fragment_size` bytes of the JSON. Only a single character may be longer.
 
     Yields:
-        The message itself if it fits into one fragment, otherwise its fragments as JSON, in order, numbered
-        from 0.
+        The message itself if it fits into one fragment. Otherwise the fragments as JSON, numbered from 0.
     """
     if len(message) <= fragment_size:
         yield message

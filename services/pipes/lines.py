@@ -1,6 +1,6 @@
-"""Lines of standard input, bounded in length, and the content of lines in pipes between commands.
+"""Reading of lines of limited length from standard input, and the contents of lines in pipes between commands.
 
-`terminal.output.print_json_line` writes lines of standard output.
+`terminal.output.print_json_line` writes lines to standard output.
 """
 
 import asyncio
@@ -42,7 +42,10 @@ class LineBoard(msgspec.Struct, omit_defaults=True):
 
 
 class LineResult(msgspec.Struct, kw_only=True):
-    """A result with its reading: from `pcie-app` to `publisher`. A reading that is an array has the address -1."""
+    """A result and the reading behind it, sent from `pcie-app` to `publisher`.
+
+    If a variable's reading is an array, its address is -1.
+    """
 
     number: _Unsigned
     stamp_ns: int | None = None
@@ -52,7 +55,7 @@ class LineResult(msgspec.Struct, kw_only=True):
 
 
 def require_pipe(command: str, values: str) -> None:
-    """Raise a SettingsError if standard input is a terminal."""
+    """Raise a SettingsError if standard input is a terminal. `values` names what the command would read."""
     if sys.stdin.isatty():
         raise SettingsError(
             f"{command} reads {values} from standard input, which is a terminal: pipe them in, or use --listen ({command} --help)"
@@ -60,7 +63,10 @@ def require_pipe(command: str, values: str) -> None:
 
 
 def blocking_lines() -> Iterator[tuple[int, bytes]]:
-    """Yield non-blank lines of standard input with their numbers, or raise an InputLineError for a long one."""
+    """Yield the number and the text of each non-blank line of standard input.
+
+    Raises an InputLineError if a line is longer than `LINE_LIMIT`.
+    """
     number = 0
     # one byte more than permitted tells a line that is too long from one that just fits
     while line := sys.stdin.buffer.readline(LINE_LIMIT + 1):
@@ -72,7 +78,7 @@ def blocking_lines() -> Iterator[tuple[int, bytes]]:
 
 
 async def lines() -> AsyncIterator[tuple[int, bytes]]:
-    """Yield the same as `blocking_lines` without blocking the event loop, so that a signal ends the wait."""
+    """Yield the items of `blocking_lines` without blocking the event loop, so that a signal can end the wait."""
     kind = os.fstat(sys.stdin.fileno()).st_mode
     # the loop supports only pipes, and files never block
     if not (stat.S_ISFIFO(kind) or stat.S_ISSOCK(kind)):
@@ -102,7 +108,10 @@ def _too_long(number: int) -> InputLineError:
 
 
 def decoded(line: bytes, number: int, kind: Any, expected: str) -> Any:
-    """Return the JSON value of a line, or raise an InputLineError with its number and `expected`."""
+    """Decode the JSON value of a line as the type `kind`.
+
+    Raises an InputLineError if the line is invalid. The message contains `number` and `expected`.
+    """
     try:
         return msgspec.json.decode(line, type=kind)
     except (msgspec.MsgspecError, RecursionError) as error:

@@ -1,8 +1,8 @@
-"""Metrics of a process for Prometheus, by the server of `prometheus_client`.
+"""Metrics of a process for Prometheus, served by `prometheus_client`.
 
     scraper ──▶ thread of start_http_server ──▶ event loop: get_status ──▶ families
 
-The import takes a tenth of a second, so `reporting` imports this module only for `--metrics`.
+Importing this module takes a tenth of a second. Therefore `reporting` imports it only if `--metrics` is given.
 """
 
 import asyncio
@@ -73,7 +73,7 @@ class _StatusCollector(Collector):
 
 
 def families(status: ProcessStatus) -> Iterator[Metric]:
-    """Yield the metrics of a process, one family after another."""
+    """Yield the metric families of a process."""
     info = GaugeMetricFamily(
         "rosbayes_process", "The process, and its deployment.", labels=["process", "version", "deployment"]
     )

@@ -4,7 +4,7 @@
                           ──▶ NOTIFY_SOCKET      readiness, and signs of life
                           ──▶ --metrics          HTTP for Prometheus
 
-Processing of frames only updates counters; everything else happens when something is requested.
+Processing a frame only updates counters. The rest is done once a second, or when a status is requested.
 """
 
 from __future__ import annotations
@@ -39,17 +39,17 @@ _SOCKET: Final = "NOTIFY_SOCKET"
 _WATCHDOG: Final = ("WATCHDOG_USEC", "WATCHDOG_PID")
 
 GetStatus = Callable[[], ProcessStatus]
-"""Function that returns the status of a process without identity, rate, CPU time and memory, which `Report` adds."""
+"""Function that returns the status of a process. `Report` adds the identity, rate, CPU time and memory."""
 
 
 class ServiceManager:
-    """The service manager that started this process, if any (systemd's sd_notify).
+    """Connection to the service manager that started this process, if any (systemd's sd_notify).
 
     A slow or absent service manager never delays or ends the process.
     """
 
     def __init__(self) -> None:
-        """Remove the variables of the service manager from the environment, because they do not concern children."""
+        """Read the service manager's environment variables, and remove them so that child processes do not get them."""
         # Its datagram socket; empty without a service manager.
         self._address = os.environ.pop(_SOCKET, "")
         if self._address.startswith("@"):  # an abstract socket
@@ -65,7 +65,7 @@ class ServiceManager:
         self._status = ""
 
     def report(self, status: str, *, ready: bool, alive: bool) -> None:
-        """Send the state of this process, and a sign of life only if the process is `alive`."""
+        """Send the state of this process to the service manager. If `alive` is True, also send a sign of life."""
         sent = []
         if ready and not self._ready:
             sent.append("READY=1")
@@ -115,7 +115,7 @@ class Report:
         self._samples: deque[tuple[float, float, int]] = deque(maxlen=_SAMPLES)
 
     def sample(self, manager: ServiceManager) -> None:
-        """Take a sample for the rate, and report to the service manager."""
+        """Record the CPU time and the number of frames for the rates, and report to the service manager."""
         # not `status`, which would read /proc every second
         status = self._get_status()
         completed = status.frames.completed if status.frames is not None else 0
@@ -123,7 +123,7 @@ class Report:
         manager.report(status.why, ready=status.ready, alive=self._is_alive())
 
     def status(self) -> ProcessStatus:
-        """Return the process's status, completed with what all processes report."""
+        """Return the status from `get_status`, completed with the values that every process reports."""
         status, now, cpu_s = self._get_status(), time.monotonic(), time.process_time()
         alive = self._is_alive()
         frames = status.frames
@@ -163,7 +163,7 @@ def _check(directory: Path | None) -> None:
 
 
 def check_metrics(metrics: str, *, insecure: bool) -> None:
-    """Raise a SettingsError if other machines could read the metrics, unless `insecure` permits it."""
+    """Raise a SettingsError if `insecure` is False and other machines could read the metrics."""
     # a host name counts as another machine, even if it resolves to this one
     if metrics and not insecure and not metrics_endpoint(metrics).is_loopback:
         raise SettingsError(
@@ -218,6 +218,6 @@ async def _keep_sampling(report: Report, manager: ServiceManager) -> None:
 def serve_status_in_thread(
     directory: Path | None, name: str, get_status: GetStatus, **more: Any
 ) -> Iterator[None]:
-    """Report the status from another thread within the context, for a process whose main thread blocks."""
+    """Report the status from another thread within the context. Use it in a process whose main thread blocks."""
     with in_thread(lambda: serve_status(directory, name, get_status, **more)):
         yield

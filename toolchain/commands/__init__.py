@@ -1,1 +1,1 @@
-"""The `toolchain` command and its subcommands, one file each."""
+"""The `toolchain` command and its subcommands."""

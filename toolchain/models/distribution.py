@@ -34,9 +34,9 @@ def _is_whole(number: object) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class IntegerType:
-    """The whole numbers `low` to `high`, each times `scale`; a reading between two of them counts as the nearest.
+    """The whole numbers from `low` to `high`, each times `scale`. A reading between two values counts as the nearer.
 
-    With `wraps` they are on a circle, and `high` is adjacent to `low`.
+    With `wraps`, the values are on a circle, where `high` is adjacent to `low`.
     """
 
     low: int
@@ -112,10 +112,10 @@ class IntervalType:
 
 @dataclass(frozen=True, slots=True, init=False)
 class LabelType:
-    """Named values. Their numbers are 0, 1, 2 ... in order, with two exceptions.
+    """Named values. The names stand for the numbers 0, 1, 2 ... in order, with two exceptions.
 
-    Names that are equally spaced numbers (`10`, `20`, `30`) have these numbers. `false`, `no` and `off` are
-    0, and `true`, `yes` and `on` are 1, regardless of the order, as in a ROS bool.
+    If the names are equally spaced numbers (`10`, `20`, `30`), each name stands for its number. In any order, `false`,
+    `no` and `off` stand for 0, and `true`, `yes` and `on` for 1, as in a ROS bool.
     """
 
     labels: tuple[str, ...]
@@ -172,7 +172,7 @@ class Symbol:
     bits: int = 0
     """Number of address bits of the symbol's column in the machine. 0 means the fewest bits that suffice."""
     on_range: Literal["error", "clamp", "missing"] = "error"
-    """Treatment of a reading out of range: an error, the nearest end, or a missing reading."""
+    """What a reading out of range counts as: an error, the nearest value in range (`clamp`), or a missing reading."""
     on_missing: Literal["error", "missing"] = "error"
     """`missing` if a reading may be missing."""
 
@@ -188,7 +188,7 @@ class Symbol:
 
     @property
     def period(self) -> int | None:
-        """The number of values in a turn, if the symbol's type wraps; otherwise None."""
+        """The number of values in a full turn if the symbol's type wraps, or None if it does not."""
         return self.type.size if self.type.wraps else None
 
     def values(self) -> NDArray[np.float64]:
@@ -197,12 +197,12 @@ class Symbol:
         return values
 
     def shown(self, at: int) -> str:
-        """Return a value as its label or number."""
+        """Return the value with the index `at` as text: its label or its number."""
         return self.type.labels[at] if self.type.labels else f"{self.values()[at]:g}"
 
     @property
     def reading(self) -> dict[str, Any]:
-        """The arguments of `Known` or `PriorSelect` that come from the symbol."""
+        """The arguments for `Known` or `PriorSelect` that the symbol defines."""
         return {
             "name": self.name,
             "bits": self.bits,
@@ -217,7 +217,7 @@ class Symbol:
         }
 
     def dimension(self) -> Dimension:
-        """Return the symbol as a searched dimension, or raise a ModelError."""
+        """Return the symbol as a searched dimension, or raise a ModelError if it has too many values."""
         return dimension(
             self.name,
             size=self.size,
@@ -228,7 +228,7 @@ class Symbol:
         )
 
     def index(self, label: str) -> int:
-        """Return the index of the value with this label or number, or raise a ModelError."""
+        """Return the index of the value with this label or number, or raise a ModelError if there is none."""
         if label in self.type.labels:
             return self.type.labels.index(label)
         if not self.type.labels and NUMBER.fullmatch(label):
@@ -246,7 +246,7 @@ class Symbol:
 
 
 Formula: TypeAlias = Callable[..., ArrayLike] | ArrayLike
-"""A function of the parents' values, or constant numbers. The function gets float64 arrays of equal shape."""
+"""Constant numbers, or a function of the parents' values. The function gets a float64 array for each parent."""
 
 _SUM_TOLERANCE: Final = 1e-6
 
@@ -260,15 +260,15 @@ class Distribution:
     given: tuple[Symbol, ...]
     """The parents: the symbols on which `symbol` depends."""
     table: NDArray[np.float64]
-    """float64[size of the symbol, size of each parent], summing to 1 over the first axis."""
+    """float64[size of the symbol, size of each parent]. The sum over the first axis is 1."""
     normal: Normal | None = None
-    """The normals from which the table was computed, or None. Their arrays have an entry for each combination of the
-    parents' values; the last parent varies fastest.
+    """The normal distributions from which the table was computed, or None. Their arrays have an entry for each
+    combination of the parents' values. The last parent varies fastest.
     """
 
     @property
     def scope(self) -> tuple[Symbol, ...]:
-        """The symbols of the axes of its table."""
+        """The symbols of the table's axes, in order."""
         return (self.symbol, *self.given)
 
     @property
@@ -282,10 +282,10 @@ class Distribution:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Potential:
-    """A function of some symbols that is a factor of the joint distribution but not a distribution itself."""
+    """A factor of the joint distribution that need not be a distribution: a non-negative function of some symbols."""
 
     scope: tuple[Symbol, ...]
-    """The symbols of the axes of its table."""
+    """The symbols of the table's axes, in order."""
     table: NDArray[np.float64]
     """float64[size of each symbol], each number at least 0."""
 
@@ -373,13 +373,13 @@ def conditional_normal(
 
 
 def function(symbol: Symbol, given: Sequence[Symbol], value: Formula) -> Distribution:
-    """Return P(symbol | given) for a function of the parents in `given`: 1 at the function's value, 0 elsewhere.
+    """Return P(symbol | given) for the function `value` of the parents: 1 at the function's value, 0 elsewhere.
 
-    The function gets the parents' values as numbers. If the symbol has `on_range = clamp`, results beyond its first
-    or last value become that value.
+    The function gets the parents' values as numbers. If the symbol has `on_range = clamp`, a result out of range
+    becomes the nearest value in range.
 
     Raises:
-        ModelError: The function returns a value that the symbol does not have.
+        ModelError: The function returns a value that is out of the symbol's range or not finite.
     """
     given = tuple(given)
     scope = _scope(symbol, given)

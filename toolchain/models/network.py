@@ -1,7 +1,7 @@
 """The network that a BM2 samples: the relevant factors of a question and their symbols (thesis 2.1.3).
 
-Known symbols remain variables, because a reading may be missing; the value of a given symbol is fixed in the tables.
-Symbols that change no answer, because their distributions sum to 1, are left out.
+Known symbols remain variables, because a reading may be missing. The tables contain a given symbol only at its value.
+If a symbol changes no answer, because its distribution sums to 1, it is left out.
 """
 
 import math
@@ -27,13 +27,15 @@ class NetworkModel:
     symbols: tuple[Symbol, ...]
     """The variables of the machine, in the order of the joint distribution."""
     factors: tuple[Term, ...]
-    """The factors, each computed by one CDE of the machine; the names in a scope are in the order of `symbols`."""
+    """The factors. Each has a conditional distribution encoder (CDE) of its own in the machine. The names in a scope are in
+    the order of `symbols`.
+    """
     titles: tuple[str, ...]
     """The name of each factor, such as P(A | B)."""
     variables: tuple[Variable, ...]
     """The known variables as in `deployment.toml`, in the order of a frame's readings."""
     searched: tuple[Dimension, ...]
-    """The searched variables as in `deployment.toml`, the slowest-varying first."""
+    """The searched variables as in `deployment.toml`. The first varies slowest in a posterior."""
 
     def __repr__(self) -> str:
         return f"NetworkModel({self.name!r}, {len(self.symbols)} variables, {len(self.factors)} factors)"
@@ -59,10 +61,10 @@ class NetworkModel:
         return math.prod(each.size for each in self.searched)
 
     def exact(self, addresses: Sequence[int | None]) -> NDArray[np.float64]:
-        """Return the exact posterior of the searched variables together, float64[lines]; the first varies slowest.
+        """Return the exact joint posterior of the searched variables, float64[lines]. The first varies slowest.
 
-        There is an address per known variable; None for a missing reading. A ModelError if the readings have the
-        probability 0, or inference needs a table above the limit.
+        `addresses` has an address for each known variable, or None for a missing reading. Raises a ModelError if the
+        readings have the probability 0, or if inference needs a table above the limit.
         """
         asked = [each.label for each in self.searched]
         sizes = dict(zip(self.names, self.cardinalities, strict=True))
@@ -131,7 +133,10 @@ def network_model(
 
 
 def network_of(model: Model) -> NetworkModel:
-    """Return a naive fusion as a network, whose tables all depend on all searched variables, or raise a ModelError."""
+    """Return a naive Bayesian fusion as a network. Each of its tables depends on all searched variables.
+
+    Raises a ModelError if a variable selects the prior, or if a variable is both searched and known.
+    """
     if model.prior_select is not None:
         raise ModelError(
             f"{model.name}: {model.prior_select.name} selects the prior, which only a BM1 has: build one with "
