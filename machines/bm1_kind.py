@@ -50,7 +50,11 @@ class BM1Kind(MachineKind):
     }
 
     def due_sections(self, parameters: BM1Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-        """Yield the prior's section, one per column with a table (MIFs in the thesis), and one for an RNG's table."""
+        """Yield the name, type and shape of each section that a file must have.
+
+        The sections are the prior, a table for each column (a MIF in the thesis), and a table of random numbers. A
+        section is absent if the machine does not have the table.
+        """
         yield "prior", "<u2", (parameters.prior_addresses, parameters.lines)
         if parameters.has_tables:
             for column, bits in enumerate(parameters.sensor_bits, start=1):
@@ -64,7 +68,7 @@ class BM1Kind(MachineKind):
         return BM1Machine(parameters, sections["prior"], columns, sections.get("rng"))
 
     def registers(self, parameters: BM1Parameters) -> UsedRegisters:
-        """Return the registers of a board: INPUTS instead of SENSORS if it has replicas or inputs per cell."""
+        """Return the registers of a board. Readings are in SENSORS; with replicas or inputs per cell, in INPUTS."""
         inputs, results = math.prod(parameters.input_shape), math.prod(parameters.count_shape)
         size = f"{parameters.sensors} sensors and {parameters.lines} lines"
         if not _is_plain(parameters):
@@ -107,7 +111,7 @@ class BM1Kind(MachineKind):
         )
 
     def contents(self, machine: BM1Machine) -> Blocks:
-        """Return the address widths of the sensor columns, and the codes of a prior that a host may overwrite."""
+        """Return the initial words of registers: the columns' address widths, and the codes of a written prior."""
         parameters = machine.parameters
         # a machine with inputs per cell can have more sensors than fit into the registers
         contents = {"CAP_SENSOR_BITS": bytes(parameters.sensor_bits[:_SENSOR_BITS_MAX])}
@@ -120,20 +124,20 @@ class BM1Kind(MachineKind):
         return make_kernel(machine)
 
     def on_board(self, kernel: BM1Kernel, memory: Mapping[str, memoryview]) -> BoardMachine:
-        """Return the kernel as a board's machine, whose inputs and results are in `memory`, the board's registers."""
+        """Return a board's machine that runs the kernel. Its inputs and results are in the board's blocks, `memory`."""
         return _OnBoard(kernel, memory)
 
     def on_host(self, machines: Sequence[BM1Machine]) -> HostMachine:
-        """Return the machines of all boards, each with its lines of the model."""
+        """Return the host's view of all boards' machines. Each machine has some lines of the model."""
         return _OnHost(machines)
 
     def joint_reason(self, reasons: Sequence[int]) -> int:
-        """Return the first of OVERFLOW, MAX_CYCLES and IMPOSSIBLE that a replica has, or SLICE if none has them."""
+        """Return OVERFLOW, MAX_CYCLES or IMPOSSIBLE, the first in this order that a replica has, or otherwise SLICE."""
         joint = joint_reason([StopReason(reason) for reason in reasons], range(len(reasons)))
         return joint if joint is not StopReason.NONE else StopReason.SLICE
 
     def infer(self, results: Sequence[BoardResult], _: Sequence[str] = ()) -> Inference:
-        """Return the joint posterior of all boards, each of which has some lines of every replica."""
+        """Return the joint posterior of all boards. Each board has some lines of the model, for every replica."""
         joint: npt.NDArray[np.float64] | None = None
         totals: list[int] = []
         if results and results[0].replica_cycles:
@@ -159,7 +163,7 @@ class BM1Kind(MachineKind):
     def posterior(
         self, machines: Sequence[BM1Machine], frame: FrameInput, _: Sequence[str] = ()
     ) -> tuple[npt.NDArray[np.float64], Mapping[str, str]]:
-        """Run the machines as `machines.posterior.posterior` does; the details are empty."""
+        """Run the machines with `machines.posterior.posterior`. Return the posterior, and no details."""
         values = posterior(
             machines,
             frame.addresses,

@@ -1,6 +1,7 @@
 """BM2 as a machine kind: sections of the programming file, registers, frames and posteriors (thesis 2.1.3).
 
-After each start or resume, a board draws one batch of samples, or if it stores them in a stream, as many as fit.
+After each start or resume, a board draws one batch of samples. If a board has a stream, which stores the samples, it
+draws as many samples as the stream's buffer holds.
 """
 
 import math
@@ -34,7 +35,7 @@ from machines.kind import (
 from machines.parameters import CYCLES_MAX, RngKind, RngReset, SampleEvery, Sequencer
 
 STREAM_WORDS_MAX: Final = 4096
-"""Maximum number of words of the stream's buffer: the size of the block STREAM in the register map."""
+"""Maximum number of words in the stream's buffer. It is the size of the block STREAM in the register map."""
 
 BATCHES: Final = 20
 """Number of batches into which the samples of a frame without a stream are divided.
@@ -43,7 +44,7 @@ The means of the batches show how much samples depend on each other.
 """
 
 STREAM_BYTES_MAX: Final = 3 << 20
-"""Maximum size in bytes of a frame's streams, of all boards together: one message between services carries them."""
+"""Maximum size in bytes of the streams of all boards in a frame, because one message between services has them all."""
 
 _STARTS_KEPT: Final = 4096  # start states that a host remembers
 _ORDERS: Final = tuple(Sequencer)
@@ -53,7 +54,7 @@ _NO_BIT: Final = 2**32 - 1
 
 
 class BM2Kind(MachineKind):
-    """Approximate inference by Gibbs sampling, bit by bit: every board is a chain of the whole model (thesis 2.1.3)."""
+    """Approximate inference by Gibbs sampling, bit by bit (thesis 2.1.3). Each board runs one chain of the model."""
 
     name = "BM2"
     has_hardware = False
@@ -69,7 +70,11 @@ class BM2Kind(MachineKind):
     }
 
     def due_sections(self, parameters: BM2Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-        """Yield one section per CDE, one per factor (its non-zero entries), and one for a table of random numbers."""
+        """Yield the name, type and shape of each section that a file must have.
+
+        Each CDE has a section, and so has each factor (its non-zero entries). The last section is the table of random
+        numbers, if the machine has it.
+        """
         for at in range(parameters.cdes):
             bits = len(parameters.factor_bits(at))
             yield f"cde {at}", "<u2", (bits << bits >> 1,)
@@ -124,7 +129,7 @@ class BM2Kind(MachineKind):
         )
 
     def contents(self, machine: BM2Machine) -> Blocks:
-        """Return the default settings of a frame, which a host may overwrite."""
+        """Return the initial words of registers: the default settings of a frame. A host may overwrite them."""
         return _settings_blocks(machine.parameters)
 
     def kernel(self, machine: BM2Machine) -> BM2Kernel:
@@ -132,11 +137,11 @@ class BM2Kind(MachineKind):
         return make_bm2_kernel(machine)
 
     def on_board(self, kernel: BM2Kernel, memory: Mapping[str, memoryview]) -> BoardMachine:
-        """Return a kernel behind the registers of a board."""
+        """Return a board's machine that runs the kernel. Its inputs and results are in the board's blocks, `memory`."""
         return _OnBoard(kernel, memory)
 
     def on_host(self, machines: Sequence[BM2Machine]) -> HostMachine:
-        """Return the machines of all boards, each with a chain of the model."""
+        """Return the host's view of all boards' machines. Each machine runs one chain of the whole model."""
         return _OnHost(machines)
 
     def infer(self, results: Sequence[BoardResult], variables: Sequence[str] = ()) -> Inference:
@@ -247,7 +252,7 @@ def _start_of(
 
 
 def kernels_of(machines: Sequence[BM2Machine]) -> list[BM2Kernel]:
-    """Return kernels for `run_batches`; they have no streams, because a stream does not change the samples."""
+    """Return kernels for `run_batches`. The kernels have no streams, because a stream does not change the samples."""
     return [
         make_bm2_kernel(replace(machine, parameters=replace(machine.parameters, stream=0)))
         for machine in machines
@@ -255,7 +260,7 @@ def kernels_of(machines: Sequence[BM2Machine]) -> list[BM2Kernel]:
 
 
 def run_batches(kernels: Sequence[BM2Kernel], frame: FrameInput) -> list[BoardResult]:
-    """Run a frame on the kernels of all boards, in batches as on boards; a StartError if the frame does not fit."""
+    """Run a frame on all boards' kernels, in batches as on boards. Raises a StartError if the frame does not fit."""
     starts, settings = _OnHost([kernel.machine for kernel in kernels]).starts(frame)
     first, *others = _batch_ends(settings.target_count)
     results = []
@@ -345,7 +350,7 @@ class Kept(msgspec.Struct, array_like=True):
     stream: bytearray = msgspec.field(default_factory=bytearray)
 
     def add(self, answer: memoryview) -> None:
-        """Add an answer of the board: the words of `UsedRegisters.answer`."""
+        """Add an answer of the board. The answer has the words of the blocks in `UsedRegisters.answer`."""
         end = 4 * self.parameters.result_words
         self.samples, self.unused, bit, *streamed = np.frombuffer(answer[end : end + 16], "<u4").tolist()
         self.timed_out_bit = -1 if bit == _NO_BIT else bit

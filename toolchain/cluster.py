@@ -38,7 +38,7 @@ Work: TypeAlias = Callable[[int], Any]
 Keep: TypeAlias = Callable[[int, Any], None]
 
 BATCH_S: Final = 2.0
-"""Maximum seconds of work in a batch: long, because dask itself takes about 15 ms of CPU time for each batch."""
+"""Maximum seconds of work in a batch. Batches are long, because dask takes about 15 ms of CPU time for each batch."""
 _SMALLEST_S: Final = BATCH_S / 20
 """Seconds of work in the first batches, until the speed is known, and in the last, so that workers finish together."""
 _AHEAD: Final = 3
@@ -54,18 +54,18 @@ _LOOPBACK: Final = re.compile(r"127(\.\d+){3}|\[::1]|localhost")
 
 
 class Job(Protocol):
-    """Pieces of work with the same tables. A job is pickled, and so is every result."""
+    """Numbered pieces of work that use the same tables. Jobs and results must be picklable."""
 
     def prepare(self) -> Work:
-        """Return a function that does the piece of work with a given number."""
+        """Return the function that does one piece of work, and returns its result. It takes the number of the piece."""
 
 
 Run: TypeAlias = Callable[[Job, Sequence[int], Keep], None]
-"""A function that computes the pieces with the given numbers, and passes each result to `keep` when it is there."""
+"""A function that does the pieces with the given numbers, and calls `keep` for each result as soon as it has it."""
 
 
 def in_this_process(job: Job, numbers: Sequence[int], keep: Keep) -> None:
-    """Do the pieces in this process, in order."""
+    """Do the pieces with these numbers in this process, one after another."""
     if numbers:
         work = job.prepare()
         for number in numbers:
@@ -73,9 +73,9 @@ def in_this_process(job: Job, numbers: Sequence[int], keep: Keep) -> None:
 
 
 def in_order(run: Run, job: Job, numbers: Sequence[int], advance: Callable[[], None]) -> list[Any]:
-    """Do the pieces of a job, and call `advance` after each.
+    """Do the pieces with these numbers, call `advance` after each piece, and return the results.
 
-    Results are returned in the order of the numbers, however they arrive, because sums of floats depend on the order.
+    Results may arrive in any order. They are returned in the order of `numbers`, because sums of floats depend on it.
     """
     found: dict[int, Any] = {}
 
@@ -93,7 +93,7 @@ class ClusterError(ToolchainError):
 
 @dataclass(frozen=True, kw_only=True)
 class SchedulerOptions:
-    """The flags that say where independent pieces of work are done: in this process or on a cluster."""
+    """The flags that choose where independent pieces of work are done: in this process or on a cluster."""
 
     scheduler: Annotated[
         str | None,
@@ -147,7 +147,10 @@ def _check_certificates(files: dict[str, Path | None]) -> None:
 
 @contextmanager
 def runner(options: SchedulerOptions) -> Iterator[Run]:
-    """Yield the function that does pieces of work where the options say, or raise a ClusterError."""
+    """Yield a function that does pieces of work in the place that the options choose.
+
+    Raises a ClusterError if the scheduler cannot be used.
+    """
     address = options.scheduler
     if address is None:
         yield in_this_process
@@ -211,7 +214,7 @@ async def _greet(address: str, arguments: dict[str, Any]) -> None:
 
 @cache
 def software() -> str:
-    """Return a hash of the software on this host on which results depend: rosbayes, NumPy, Numba and SciPy."""
+    """Return a hash of this host's software that affects results: rosbayes, NumPy, Numba and SciPy."""
     digest = sha256()
     for name in ("numpy", "numba", "scipy"):
         with suppress(metadata.PackageNotFoundError):

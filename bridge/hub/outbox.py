@@ -1,11 +1,11 @@
 """The queue of output for one client: ordered, bounded, and throttled if requested.
 
-The owner of the socket drains the outbox as fast as the socket accepts data. While it accepts none, newer
-messages of a topic replace older ones here, and nothing else in the hub slows down. Answers and requests of
-services are never dropped: a client that lets them accumulate beyond the bound has *overflowed*.
+The owner of the socket drains the outbox as fast as the socket accepts data. While the socket accepts no data,
+newer messages of a topic replace older messages in the outbox. A slow client does not slow down other clients.
+Answers and requests of services are never dropped. If they exceed the bound, the client has *overflowed*.
 
-A dropped message leaves a gap in the queue, so dropping costs no more than sending. A message for a client
-that requested fragments is queued whole, and counts towards the bound until its last fragment is sent.
+A dropped message leaves a gap in the queue, so dropping takes no longer than sending. If a client requested
+fragments, each message is queued whole. The message counts towards the bound until its last fragment is sent.
 """
 
 import itertools
@@ -81,7 +81,7 @@ class Outbox:
     )
 
     def __init__(self, max_bytes: int, largest: int = 0) -> None:
-        """Bound the queue to `max_bytes` bytes; a single payload has at most `largest` bytes."""
+        """Bound the queue to `max_bytes` bytes. `largest` is the maximum size of a single answer in bytes."""
         self._max_bytes = max_bytes
         self._largest = largest
         # All queued messages in order. `_droppable` and each lane's `queued` have the same entries of topics, in the
@@ -118,11 +118,11 @@ class Outbox:
 
     @property
     def congested(self) -> bool:
-        """Return whether one more answer could exceed the bound: the client must read its answers first."""
+        """Return whether one more answer could exceed the bound. If so, the client must first read earlier answers."""
         return self.undroppable > 0 and self.undroppable + self._largest > self._max_bytes
 
     def put(self, payload: bytes, fragment_size: int = 0) -> None:
-        """Queue an answer or a request of a service or an action, which must not be dropped."""
+        """Queue an answer or a request of a service or an action. The outbox never drops it."""
         if self._bypass(payload, fragment_size):
             return
         # Messages of topics are dropped for an answer, never the reverse.
@@ -134,7 +134,7 @@ class Outbox:
             self.overflowed = True
 
     def offer(self, lane: Lane, payload: bytes, now: float) -> None:
-        """Queue a topic's message, hold it until its throttle admits it, or drop it."""
+        """Queue a topic's message, hold it until the lane's throttle admits it, or drop it."""
         if lane.throttle:
             # A message must not overtake the ones that are held.
             if now < lane.next_time or lane.held:
@@ -149,7 +149,7 @@ class Outbox:
             wire.append(payload)
 
     def offer_all(self, lane: Lane, payloads: list[bytes], now: float) -> None:
-        """Offer each message of a list; while the socket accepts data, this takes hardly longer than offering one."""
+        """Offer each message of a list. While the socket accepts data, this is hardly slower than a single `offer`."""
         if self.wire is None or lane.throttle or lane.fragment_size or not self.empty:
             for payload in payloads:
                 self.offer(lane, payload, now)
@@ -157,7 +157,7 @@ class Outbox:
             self.wire += payloads
 
     def pop(self) -> bytes | None:
-        """Take the next message or fragment for the socket, or None."""
+        """Remove and return the next message or fragment for the socket, or None if nothing is queued."""
         if self._fragments is not None:
             fragment = next(self._fragments, None)
             if fragment is not None:
@@ -191,7 +191,7 @@ class Outbox:
         return not lane.throttle or bool(lane.queue_length) or (now >= lane.next_time and not lane.held)
 
     def release(self, now: float) -> None:
-        """Queue the messages that throttles admit at `now`, at most one of each lane."""
+        """Queue the held messages that the throttles of their lanes admit at `now`, at most one for each lane."""
         for lane in [lane for lane in self._holding if lane.next_time <= now]:
             lane.next_time = now + lane.throttle
             self._deliver(lane, self._take_held(lane))
@@ -200,8 +200,8 @@ class Outbox:
     def adjust(self, lane: Lane, throttle: float, queue_length: int) -> None:
         """Change a lane's throttle and queue length.
 
-        A message that the throttle no longer holds back is queued; messages beyond the new length are dropped, the
-        oldest first.
+        If the new throttle is 0, all held messages are queued. Messages beyond the new length are dropped, the oldest
+        first.
         """
         # The throttle would have admitted the next message one old interval after the last one; now one new interval.
         lane.next_time += throttle - lane.throttle
@@ -216,7 +216,7 @@ class Outbox:
             self.deadline = min(self.deadline, lane.next_time)
 
     def forget(self, lane: Lane) -> None:
-        """Drop all messages of a subscription that ended."""
+        """Drop all messages of a lane, because its subscription has ended."""
         while lane.queued:
             self._drop_queued(lane)
         while lane.held:

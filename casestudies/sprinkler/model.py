@@ -13,12 +13,12 @@ RAIN: Final = 0.2
 ON: Final = (0.4, 0.01)
 """P(S = 1 | R), for R = 0 and 1."""
 WET: Final = ((0.0, 0.8), (0.9, 0.99))
-"""P(G = 1 | S, R), a row for S = 0 and one for S = 1, each for R = 0 and 1."""
+"""P(G = 1 | S, R). The rows are for S = 0 and 1, the columns for R = 0 and 1."""
 
 GRASS_TOPIC: Final = "/sprinkler/grass"
 """Topic of G, the reading."""
 TYPE: Final = "std_msgs/UInt8"
-"""Type of `GRASS_TOPIC`, which every ROS server has installed."""
+"""Message type of `GRASS_TOPIC`. Every ROS server has this type installed."""
 
 
 def model() -> Question:
@@ -39,5 +39,5 @@ def model() -> Question:
 
 @cache
 def exact_rain(grass: int) -> float:
-    """Return P(R = 1 | G = grass) by exact inference: 0.3577 for wet grass."""
+    """Return P(R = 1 | G = grass) by exact inference. For wet grass, it is 0.3577."""
     return float(model().network().exact((grass,))[1])

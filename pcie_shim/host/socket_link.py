@@ -94,7 +94,7 @@ class SocketLink:
     """
 
     def __init__(self, endpoint: Endpoint, *, timeout: float, connect_timeout: float) -> None:
-        """Connect and receive the greeting; use `open`, which also checks it."""
+        """Connect and receive the greeting. Call `open` instead, because it also checks the greeting."""
         self.endpoint = endpoint
         self.timeout = timeout
         """Maximum time in seconds for an answer of the board, and for accepting data."""
@@ -174,10 +174,11 @@ class SocketLink:
     def open(cls, endpoint: Endpoint, *, timeout: float, connect_timeout: float | None = None) -> Self:
         """Open a link to a board that has this protocol version and register map.
 
-        The board has `connect_timeout` seconds (None: `timeout`) to listen and greet, and `timeout` for each answer.
+        The board must listen and greet within `connect_timeout` seconds (by default `timeout`). It must send each
+        answer within `timeout` seconds.
 
         Raises:
-            LinkUnreachableError: Nothing listens there.
+            LinkUnreachableError: No board listens at the endpoint.
             HeldError: Another host holds the board.
             KeyRefusedError: Host and board do not have the same key.
             GreetingMismatchError: The board has another protocol version, register map or BAR size.
@@ -218,11 +219,11 @@ class SocketLink:
         self.close()
 
     def fileno(self) -> int:
-        """Return the socket's descriptor, for a poll over many links; -1 once the link has ended."""
+        """Return the socket's descriptor for a poll over many links, or -1 if the link has ended."""
         return self._socket.fileno()
 
     def close(self, reason: str = "it was closed") -> None:
-        """End the link; later calls raise `LinkClosedError` with this reason."""
+        """End the link. Later calls raise a LinkClosedError with this reason."""
         if not self._closed:
             self._closed = reason
             self._socket.close()
@@ -230,7 +231,7 @@ class SocketLink:
     # ---- registers ------------------------------------------------------------------------------------
 
     def read32(self, address: int) -> int:
-        """Read one register; raise a DeviceGoneError if ID reads all ones."""
+        """Read one register. Raises a DeviceGoneError if the register is ID and reads all ones."""
         (value,) = WORD.unpack(self.read_block(address, 1))
         if value == ALL_ONES and address == register_map.ID:
             self._give_up(
@@ -243,7 +244,10 @@ class SocketLink:
         self.write_block(address, WORD.pack(value))
 
     def read_block(self, address: int, count: int) -> bytes:
-        """Read `count` words from `address` on, as little-endian bytes; a ShortReadError if fewer or more arrive."""
+        """Read `count` words from `address` on, as little-endian bytes.
+
+        Raises a ShortReadError if fewer or more words arrive.
+        """
         self.ask([(address, count)])
         return self.answers()[0]
 
@@ -266,9 +270,10 @@ class SocketLink:
         self._send(b"".join(requests))
 
     def answers(self) -> list[bytes]:
-        """Return the words of the requested blocks in order, as `read_block` does.
+        """Return the words of each block that `ask` has requested, in order, as little-endian bytes.
 
-        After an AccessError, close the link, because answers to the other requests may still arrive.
+        Raises a ShortReadError if fewer or more words arrive. After an AccessError, the caller must close the link,
+        because answers to later requests may still arrive.
         """
         asked, self._asked = self._asked, []
         blocks = []
@@ -286,7 +291,10 @@ class SocketLink:
         return blocks
 
     def post(self, writes: Iterable[RegisterWrite]) -> None:
-        """Send posted writes; a refusal is raised when the next answer or interrupt is received."""
+        """Send writes without waiting for replies.
+
+        If the board refuses a write, receiving the next answer or interrupt raises the error.
+        """
         self._send(b"".join(self._posted(framing.WRITE, address, words) for address, words in writes))
 
     def post_part(self, offset: int, part: Octets) -> None:
@@ -317,7 +325,7 @@ class SocketLink:
                 self._broken_send(error)
 
     def receive_done(self) -> Done | None:
-        """Receive once, after a poll; return the board's answer if it is complete."""
+        """After a poll, receive once. Return the board's answer if it is now complete, otherwise None."""
         self._check_open()
         try:
             self._fill()
@@ -342,7 +350,7 @@ class SocketLink:
         return self._give_up(SequenceError("an answer arrived without a request"))
 
     def request(self, operation: int, flags: int, address: int, count: int, payload: Octets = b"") -> Frame:
-        """Send one request and return the answer; store an interrupt that arrives before it.
+        """Send one request, and return the board's answer. An interrupt that arrives before the answer is stored.
 
         The payload of the answer is valid until the link receives again.
         """
@@ -456,7 +464,7 @@ class SocketLink:
         self._give_up(self._closed_error(error.strerror or str(error)))
 
     def timeout_error(self, timeout: float, what: str) -> LinkTimeoutError:
-        """Return the error that the board did not do `what` (a verb phrase) within `timeout` seconds."""
+        """Return the error for a board that did not do `what` (a verb phrase) within `timeout` seconds."""
         rest = ": a frame is incomplete" if self._decoder.inside_frame else ""
         return LinkTimeoutError(
             f"The board at {self.endpoint} did not {what} within {timeout:.3g} s{rest}: the link is closed"

@@ -45,12 +45,12 @@ if TYPE_CHECKING:
     from toolchain.deployment.filter import Filter
 
 QUEUE_ALL_DEPTH = 256
-"""Maximum number of frames that wait with `queue = all` before the run ends with an error."""
+"""With `queue = all`, at most this many frames wait. One more frame ends the run with an error."""
 MOST_AT_PUBLISHER = 8
-"""Maximum number of results that the publisher has not acknowledged; at this number, frames wait."""
+"""While the publisher has not acknowledged this many results, no further frame is computed."""
 
 REMEMBERED = 1000
-"""Number of the last frames over which quantiles of latencies are computed."""
+"""Quantiles of latencies are computed over the last published frames, at most this many."""
 
 _STAGES = (
     *("rosbridge_in", "waited", "register_writes", "compute", "reads", "rosbridge_out"),
@@ -87,7 +87,7 @@ class _Computing:
 
 
 class Latencies:
-    """Latencies of published frames: quantiles over the last frames, and counts over all."""
+    """Latencies of published frames: quantiles over the last `REMEMBERED` frames, and histograms over all frames."""
 
     def __init__(self) -> None:
         # A row for each of the last frames, with a column for each stage, in ns.
@@ -114,7 +114,7 @@ class Latencies:
             self._counts[at][bisect_left(BUCKETS_S, spent / 1e9)] += 1
 
     def summary(self) -> list[StageLatency]:
-        """Return the latencies of each stage; none before the first frame."""
+        """Return the latencies of each stage, or an empty list if no frame has been published yet."""
         if not self._frames:
             return []
         import numpy as np  # not before the boards have started, which takes longest
@@ -147,7 +147,7 @@ class FrameFlow:
         count: int | None,
         show: Callable[[Published], None],
     ) -> None:
-        """Start without frames; `once` ends the run after the first frame, `count` after `count` results."""
+        """Start without frames. With `once`, the run ends after one frame. With `count`, it ends after `count` results."""
         self._settings = settings
         self._deployment = deployment
         self._peers = peers
@@ -213,13 +213,13 @@ class FrameFlow:
 
     @property
     def is_idle(self) -> bool:
-        """True while no frame is between its reading and its outcome."""
+        """True while no frame waits, is computed or is being published."""
         return not self._readings and self._computing is None and not self._at_publisher
 
     # --- events at the peers -------------------------------------------------------------------
 
     def ready(self, peer: Peer) -> None:
-        """Handle a peer that has become ready: send the next frame if the run was waiting for it."""
+        """Handle a peer that has become ready. If a frame was waiting for this peer, send the frame."""
         if peer is not self._peers.subscriber:
             self._send_next()
 
@@ -244,7 +244,7 @@ class FrameFlow:
                 self._log.warning(f"{where} sent a {what}, which only another service may send")
 
     def lost(self, peer: Peer) -> None:
-        """Handle the loss of a peer: count the frame or the results that are lost with it."""
+        """Handle the loss of a peer. Count the frame or the results at the peer as lost."""
         if peer is self._peers.app and self._computing is not None:
             self.losses[LossReason.WITH_APP] += 1
             if self._follows:
@@ -256,7 +256,7 @@ class FrameFlow:
             self._at_publisher.clear()
 
     def awaited(self, peer: Peer) -> Awaited | None:
-        """Return the frame or the results that a peer has not answered yet; None if there are none."""
+        """Return the frame or the results that a peer has not answered yet, or None if it has answered everything."""
         if peer is self._peers.app and self._computing is not None:
             what, since = f"answer frame {self._computing.number}", self._computing.sent / 1e9
             return Awaited(what, since, self._settings.board_timeout + ANSWER_TIME)

@@ -3,8 +3,8 @@
     Peers ◀──── FusedLink.send ──── Subscriber, Publisher, PcieApp
           ───── FusedEnd.send ────▶
 
-Records are passed by calls, without encoding, instead of over local sockets. Boards remain separate processes or
-devices.
+Records are passed in function calls, without encoding and without local sockets. Boards remain separate processes
+or devices.
 """
 
 from collections.abc import Callable, Coroutine
@@ -41,7 +41,7 @@ class FusedLink(Link):
         return self._to_master is not None
 
     def send(self, record: Record) -> bool:
-        """Pass a record to the master; return whether the link is open."""
+        """Pass a record to the master and return True, or return False if the link is closed."""
         if self._to_master is None:
             return False
         self._to_master(cast("AnyRecord", record))
@@ -49,7 +49,7 @@ class FusedLink(Link):
 
 
 class FusedEnd:
-    """The master's end of a fused link, in place of a socket connection."""
+    """The master's end of a link inside one process. It replaces a socket connection."""
 
     def __init__(self, role: str, to_service: TakeRecord) -> None:
         self.where = f"{role} in this process"
@@ -67,9 +67,10 @@ class FusedEnd:
 def fused_services(
     settings: Settings, deployment: Deployment, to_master: Callable[[str], TakeRecord]
 ) -> dict[str, tuple[FusedEnd, Coroutine[Any, Any, int]]]:
-    """Return the three services by role: the master's end of the link, and the coroutine of the service.
+    """Return, for each of the three roles, the master's end of the link and the coroutine that runs the service.
 
-    `to_master` returns the function that receives the records of a role. Raises a SettingsError for a wrong endpoint.
+    `to_master` takes a role, and returns the function with which the master receives the records of this role. Raises
+    a SettingsError if an endpoint is wrong.
     """
     # filled by the constructors of the services, which make their links
     ends: dict[str, FusedEnd] = {}

@@ -25,7 +25,7 @@ from toolchain.deployment import Scale
 from toolchain.errors import BuildError
 
 TOLERATED: Final = 0.01
-"""Share of lost frames above which a build and a check warn."""
+"""A build and a check warn if a larger share of the frames is lost."""
 _WORK: Final = 2**26
 """Maximum number of comparisons of points with codes, for less than a second of computing.
 
@@ -41,7 +41,7 @@ _MOST_CYCLES: Final = 2**26
 
 
 class LostFrames(NamedTuple):
-    """The expected share of lost frames, a clause about them, and advice on losing fewer (empty if few are lost)."""
+    """The expected share of lost frames, a clause about the lost frames, and advice. With few, the advice is empty."""
 
     share: float
     what: str
@@ -49,7 +49,7 @@ class LostFrames(NamedTuple):
 
 
 def lost_frames(plan: MachinePlan, quantised: Quantised) -> LostFrames:
-    """Predict the lost frames of a machine, and find options that help if there are too many."""
+    """Predict the share of lost frames of a machine. If it exceeds `TOLERATED`, find options that reduce it."""
     size = plan.model.lines * plan.parameters.columns
     frames = min(_MOST_FRAMES, max(_LEAST_FRAMES, _WORK // (_POINTS * size)))
     drawn = sample_readings(plan.model, frames, seed=_SEED)

@@ -1,4 +1,4 @@
-"""The commands `toolchain build`, which builds a deployment from a model or a network file, and `toolchain check`."""
+"""The commands `toolchain build`, which builds a deployment, and `toolchain check`, which reports mistakes."""
 
 import json as json_text
 from collections import Counter
@@ -44,12 +44,12 @@ def build(
     target: TargetOptions,
     sources: SourcesFlag = None,
 ) -> None:
-    """Build a deployment: programming files, deployment.toml, a report, and a BM1's hardware project.
+    """Build a deployment: programming files, deployment.toml and a report. A BM1 also gets a hardware project.
 
     `toolchain build casestudies/boat -o build/boat --partitions 4 --uri ws://localhost:9090
     --topic /boat/sensors --type boat_msgs/Sensors`
 
-    Of a network:
+    For a network file:
 
     `toolchain build asia.bif --searched bronc --known smoke,dysp -o build/asia --uri ws://localhost:9090
     --topic /patient --type clinic_msgs/Patient`
@@ -105,10 +105,10 @@ def check(
     ] = None,
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object per line.")] = False,
 ) -> None:
-    """Report mistakes before anything runs: in a model as it would be built, or in a deployment.
+    """Report mistakes in a model, a network file or a deployment, before anything runs.
 
-    For example `toolchain check casestudies/boat --partitions 4`, or `toolchain check build/boat`. It takes all options
-    of `toolchain build`, and needs none of them. The exit code is 2 if an error is among the findings, otherwise 0.
+    For example `toolchain check casestudies/boat --partitions 4`, or `toolchain check build/boat`. The command accepts
+    all options of `toolchain build`, but requires none. The exit code is 2 if it reports an error, otherwise 0.
     """
     del directory  # accepted, so that a `build` command becomes a check by changing only its first word
     from toolchain.checks.check import check_deployment
