@@ -32,11 +32,11 @@ class NameFormError(UsageError):
 
 
 class TypeConflictError(UsageError):
-    """Raised when one client uses a topic twice with different types or options, or serves the same name twice."""
+    """Raised when a client uses a topic with different types or options, or serves one service or action twice."""
 
 
 class OptionError(UsageError):
-    """Raised when a number is out of range, a file is unusable, or two options exclude each other."""
+    """Raised when an option has an invalid value, names an unusable file, or conflicts with another option."""
 
 
 class ConcurrentReadError(UsageError):
@@ -44,7 +44,7 @@ class ConcurrentReadError(UsageError):
 
 
 class WrongThreadError(UsageError):
-    """Raised when a client is used in a thread other than its event loop's."""
+    """Raised when a client is used outside the thread of its event loop."""
 
 
 class ActionlibError(UsageError):
@@ -52,35 +52,35 @@ class ActionlibError(UsageError):
 
 
 class EncodeError(UsageError):
-    """Raised when an object cannot be encoded because of a type, a NaN, an infinity, its depth or its size."""
+    """Raised when an object cannot be encoded, for example because it contains a NaN or is nested too deeply."""
 
 
 class MessageTooLargeError(EncodeError):
-    """Raised when a message exceeds the limit of this client, or the known limit of the server."""
+    """Raised when a message to be sent is larger than the limit of this client, or the known limit of the server."""
 
 
 class MessageTypeError(EncodeError):
-    """Raised when a message does not fit its type: a misspelt field, or an array of another shape."""
+    """Raised when a message does not fit its type, for example because of a misspelt field or a wrong array shape."""
 
 
 class TopicLeftOutError(BridgeError):
-    """Raised when a client no longer subscribes to a topic, because its messages exceed the client's limit."""
+    """Raised when a client no longer subscribes to a topic because the messages exceed the client's size limit."""
 
 
 class DecodeError(BridgeError):
-    """Raised when received bytes are not a message within the limits of size and depth."""
+    """Raised when received bytes are not a valid message, or the message is too large or nested too deeply."""
 
 
 class UnreachableError(BridgeError):
-    """Raised when nothing answers at the URI: refused, unknown host, no route, or no answer in time."""
+    """Raised when a URI is unreachable, for example because nothing answers in time or the host is unknown."""
 
 
 class NotRosbridgeError(BridgeError):
-    """Raised when something other than a WebSocket server answers at the URI."""
+    """Raised when a server does not answer like a WebSocket server, or does not speak TLS at a `wss://` URI."""
 
 
 class AccessRefusedError(UsageError):
-    """Raised when a server refuses this client because of its token or certificate."""
+    """Raised when a server refuses this client because of the client's token, headers or certificate."""
 
 
 class DisconnectedError(BridgeError):
@@ -88,7 +88,7 @@ class DisconnectedError(BridgeError):
 
 
 class StateTimeoutError(BridgeError):
-    """Raised when a connection did not reach a state in time."""
+    """Raised when a connection did not reach the awaited state in time."""
 
 
 class NoMessageError(BridgeError):
@@ -96,11 +96,11 @@ class NoMessageError(BridgeError):
 
 
 class NoAnswerError(BridgeError):
-    """Raised when a service did not answer, or a goal did not end, in time."""
+    """Raised when a service did not answer in time, or a goal did not end in time."""
 
 
 class SlowPeerError(BridgeError):
-    """Raised when the server does not accept messages in time, or too many are waiting."""
+    """Raised when the server does not accept messages in time, or too many messages, calls or goals are pending."""
 
 
 class ServiceError(BridgeError):
@@ -111,7 +111,7 @@ class ServiceError(BridgeError):
     """
 
     def __init__(self, reason: str, service: str = "") -> None:
-        """Store the reason separately from the sentence, because the reason of a handler is sent unchanged."""
+        """Store the reason apart from the error's sentence. A handler's reason is sent to the caller unchanged."""
         self.reason = reason
         where = f"service {service} refused the call" if service else "the call was refused"
         super().__init__(f"{where}: {reason or 'it gave no reason'}")
@@ -121,7 +121,7 @@ class GoalError(BridgeError):
     """Raised when an action refuses a goal, or the goal ends without a result.
 
     Attributes:
-        reason: Text of the server.
+        reason: Explanation from the server, or an empty text.
     """
 
     def __init__(self, reason: str, action: str) -> None:
@@ -140,6 +140,6 @@ class FieldMissingError(BridgeError):
 
 
 class FieldAmbiguousError(BridgeError):
-    """Raised when a bare name occurs more than once in a message. The error lists the paths of these fields."""
+    """Raised when a name without a path fits several fields of a message. The error lists the paths of these fields."""
 
     exit_code = 4

@@ -40,7 +40,7 @@ def run_tool(
     *,
     separate: bool = False,
 ) -> str:
-    """Run a tool in a folder and return its output, without warnings if `separate`, or raise a HardwareToolError."""
+    """Run a tool in a folder and return its output, or raise a HardwareToolError. `separate` omits standard error."""
     if missing(command[:1]):
         raise HardwareToolError(f"{command[0]} is not installed (Debian: apt-get install {command[0]})")
     try:
@@ -79,13 +79,13 @@ SOURCES: Final = (
     "bm1_axi.vhd",
     "bm1.vhd",
 )
-"""The hardware's files in the order of analysis; the generated package of parameters comes after the first."""
+"""The VHDL files in the order of analysis. The generated package of parameters is analysed after the first file."""
 
 PARAMETERS: Final = "bm1_parameters.vhd"
 
 
 def in_order(sources: Sequence[Path | str], parameters: Path | str = PARAMETERS) -> list[str]:
-    """Return VHDL files in the order of analysis: the package of parameters comes after the first of `sources`."""
+    """Return VHDL files in the order of analysis: the first of `sources`, the package of parameters, the others."""
     return [str(sources[0]), str(parameters), *map(str, sources[1:])]
 
 
@@ -116,7 +116,7 @@ MEMORY_FOLDER: Final = "Memory_MIFs"
 
 
 def write_board_files(image: Image, folder: Path) -> None:
-    """Write the files of an image's hardware, as a build does; the VHDL generic BOARD must be the partition's index."""
+    """Write an image's VHDL parameters and memory files. The VHDL generic BOARD must be the image's partition index."""
     images = [image] * image.partition.count  # a board uses its own entry only
     (folder / PARAMETERS).write_text(parameters_vhd(_deployment(image), images), "ascii")
     (folder / MEMORY_FOLDER).mkdir(exist_ok=True)
@@ -180,11 +180,11 @@ class Simulator(StrEnum):
     GHDL = "ghdl"
     """GHDL interprets the VHDL. It compiles a simulation within seconds."""
     VERILATOR = "verilator"
-    """Verilator runs a translation to Verilog. It is a hundred times as fast as GHDL, and compiles within minutes."""
+    """Verilator compiles a Verilog translation within minutes. Its simulation is a hundred times as fast as GHDL's."""
 
     @property
     def tools(self) -> tuple[str, ...]:
-        """The programs that the simulator needs, which are also the names of their Debian packages."""
+        """The programs that the simulator needs. Each program has the name of its Debian package."""
         return ("ghdl",) if self is Simulator.GHDL else ("ghdl", "verilator", "make", "g++")
 
 
@@ -199,7 +199,7 @@ class Compiled:
 
 
 def check_tools(simulator: Simulator) -> None:
-    """Raise a HardwareToolError unless the simulator, and the VHDL that it reads, are installed."""
+    """Raise a HardwareToolError if a program of the simulator or the VHDL is not installed."""
     absent = missing(simulator.tools)
     if absent:
         raise HardwareToolError(

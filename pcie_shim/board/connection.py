@@ -21,15 +21,15 @@ from pcie_shim.register_layout import ALL_ONES
 from pcie_shim.register_map import ErrorCode
 
 SEND_S: Final = 5.0
-"""Seconds after which the link of a host that does not read the board's frames is closed."""
+"""If a host does not read the board's frames for this many seconds, the board closes the link."""
 _TOGETHER: Final = 1 << 16
 """Answers to requests that arrived together are collected, and sent whenever they reach this many bytes."""
 KEEPALIVE_S: Final = 5
-"""Interval of TCP keep-alive probes in seconds; three unanswered probes close the link."""
+"""Interval of TCP keep-alive probes in seconds. After three unanswered probes, the link is closed."""
 
 
 class Connection:
-    """A connection of a host or loader to the board, which sends the first frame: a challenge or its greeting."""
+    """A connection of a host or loader to the board. The board sends the first frame: a challenge or its greeting."""
 
     def __init__(
         self, connection: socket.socket, key: bytes, greeting: bytes, link: LinkModel | None = None
@@ -76,7 +76,7 @@ class Connection:
             self.send(greeting)
 
     def receive(self) -> bool:
-        """Receive once; return False if nothing arrived, or if the connection is closed (`open` is then False)."""
+        """Receive once, and return whether bytes arrived. If the connection is closed, `open` becomes False."""
         try:
             count = self.socket.recv_into(self.decoder.room(), 0, socket.MSG_DONTWAIT)
         except BlockingIOError:
@@ -89,7 +89,7 @@ class Connection:
         return self.open
 
     def answer(self, handle: Callable[[Frame], None]) -> None:
-        """Pass all complete frames to `handle`, and answer its RefusedErrors with ERROR."""
+        """Pass all complete frames to `handle`. If `handle` raises a RefusedError, answer with an ERROR frame."""
         self._answering = True
         self._handle_all(handle)
         self._answering = False
@@ -156,7 +156,7 @@ class Connection:
 
 
 class HostConnection(Connection):
-    """A link to a host; after its first request, the host holds the board."""
+    """A host's connection to the register port. From its first request on, the host holds the board."""
 
     def __init__(
         self,

@@ -65,7 +65,7 @@ class EmulatedBoard:
         self.programmed = 0
         """Number of images loaded so far."""
         self.done = 0
-        """Doorbell number of the last start or resume after which the machine has stopped (register DONE)."""
+        """Doorbell number of the last completed run, as in the register DONE. A start or a resume begins a run."""
         self.running = False
         """True while the machine is running and `step` must be called; registers are then read-only."""
 

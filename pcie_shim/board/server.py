@@ -34,9 +34,9 @@ from pcie_shim.register_map import ErrorCode
 _LOG: Final = logging.getLogger(__name__)
 
 PROGRAMMING_SILENCE_S: Final = 10.0
-"""Seconds without a frame from the loader, after which another loader may program the board."""
+"""If the loader sends no frame for this many seconds, another loader may program the board."""
 MAX_SILENT: Final = 16
-"""Maximum number of connections without a request per port; a new one replaces the oldest."""
+"""Maximum number of connections per port that have sent no request. A further connection replaces the oldest."""
 
 _HELD: Final = "another host holds it; only one host can drive a board at a time"
 _PROGRAMMED: Final = "another loader is programming it"
@@ -45,20 +45,20 @@ _READABLE: Final = select.EPOLLIN | select.EPOLLHUP | select.EPOLLERR
 
 
 class Board(Protocol):
-    """Registers and a machine, without sockets: blank until an image is loaded (docs/reference/registers.md)."""
+    """Registers and a machine, without sockets. A board without image is blank (docs/reference/registers.md)."""
 
     turned: float
     """Monotonic time at which the board's server last polled for requests; 0 before the first poll."""
     programmed: int
     """Number of images loaded so far."""
     done: int
-    """Doorbell number of the last start or resume after which the machine has stopped (register DONE)."""
+    """Doorbell number of the last completed run, as in the register DONE. A start or a resume begins a run."""
     running: bool
     """True while the machine is running and `step` must be called."""
 
     @property
     def image_hash(self) -> str:
-        """SHA-256 (hex) of the loaded image; zeros while blank. Any thread may read it."""
+        """SHA-256 (hex) of the loaded image, or zeros if the board is blank. Any thread may read the hash."""
 
     @property
     def interrupt_enabled(self) -> bool:
@@ -80,10 +80,10 @@ class Board(Protocol):
         """
 
     def step(self) -> None:
-        """Run the machine for one more chunk; then `running` tells whether it must continue."""
+        """Run the machine for one more chunk of cycles. Then `running` tells whether to call `step` again."""
 
     def interrupt_words(self) -> bytes:
-        """Return an interrupt's payload: the registers from DONE to COMPUTE_NS, then results if the board sends any."""
+        """Return an interrupt's payload: the registers from DONE to COMPUTE_NS, and results if the board sends them."""
 
     def release(self) -> None:
         """Stop a running machine and disable interrupts, because the host has disconnected."""
@@ -103,12 +103,12 @@ class StopSignal:
         self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
 
     def set(self) -> None:
-        """Request the end; may be called in a signal handler and repeatedly."""
+        """Ask `serve_board` to end. A signal handler may call this method. Repeated calls do no harm."""
         with suppress(OSError):
             os.write(self._write, b"x")
 
     def fileno(self) -> int:
-        """Return a descriptor that is readable once `set` was called."""
+        """Return a file descriptor that becomes readable when `set` is called."""
         return self._read
 
     def close(self) -> None:

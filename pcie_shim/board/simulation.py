@@ -1,7 +1,7 @@
-"""A simulation of a board's hardware: a child process that executes requests on its AXI4-Lite slave.
+"""A simulation of a board's hardware: a child process that executes requests on the board's AXI4-Lite slave.
 
-Requests and answers are lines of hexadecimal numbers (docs/hardware/simulation.md). The hardware's clock stands
-still between requests, and the child ends when its standard input is closed.
+Requests and answers are lines of hexadecimal numbers (docs/hardware/simulation.md). Between requests, the hardware's
+clock stands still. The child ends when its standard input is closed.
 """
 
 import contextlib
@@ -20,11 +20,11 @@ from pcie_shim.errors import SimulationError
 MOST_WORDS: Final = 256
 """Maximum number of words that one request reads."""
 ACCESS_CLOCKS: Final = 8
-"""Maximum number of clocks of an access, once the memories are filled."""
+"""Maximum number of clocks that an access takes after the hardware has filled its memories."""
 ANSWER_S: Final = 20.0
-"""Timeout of an answer in seconds, beyond ten times the usual duration of the clocks that the request takes."""
+"""Seconds that are added to ten times the expected duration of a request. The sum is the timeout of the answer."""
 START_S: Final = 600.0
-"""Timeout of the first answer in seconds, because the simulator elaborates the hardware before it."""
+"""Timeout of the first answer in seconds. Before the first answer, the simulator elaborates the hardware."""
 
 _ANSWER: Final = re.compile(rb"([0-9A-Fa-f]) ([0-9A-Fa-f]{8}) ((?:[0-9A-Fa-f]{8})*)")
 _CLOSE_S: Final = 1.0
@@ -36,11 +36,11 @@ class SimulatorAnswer(NamedTuple):
     """The answer to one request."""
 
     response: int
-    """For an access: 0, or the last word's error (SLVERR or DECERR). For a run: 1 if an interrupt ended it, else 0."""
+    """For an access, 0 or the last word's error (SLVERR or DECERR). For a run, 1 if an interrupt ended it, else 0."""
     clocks: int
     """Clocks that the request took."""
     words: bytes
-    """The words read, up to the first refused word, little-endian."""
+    """The words that were read, little-endian. If the hardware refused a word, only the earlier words are included."""
 
 
 class Simulation:
@@ -50,7 +50,7 @@ class Simulation:
     """
 
     def __init__(self, command: Sequence[str], folder: Path) -> None:
-        """Start the child, or raise a SimulationError; its first answer may take START_S."""
+        """Start the child process, or raise a SimulationError. The first answer may take START_S seconds."""
         self.speed = 0.0
 
         # The beginning of an answer whose end has not arrived.
@@ -84,7 +84,7 @@ class Simulation:
         self.close()
 
     def close(self) -> None:
-        """End the child, by force if it does not end at once."""
+        """End the child. If the child does not end within a second, kill it."""
         with contextlib.suppress(OSError):
             self._requests.close()
         try:
@@ -100,11 +100,11 @@ class Simulation:
         self._execute("z", 0, 0, 2, START_S)
 
     def run(self, clocks: int) -> SimulatorAnswer:
-        """Run until an interrupt, for at most this number of clocks."""
+        """Run the hardware until an interrupt, but at most for the given number of clocks."""
         return self._execute("c", clocks, 0, clocks)
 
     def read(self, address: int, count: int) -> SimulatorAnswer:
-        """Read up to MOST_WORDS words, and stop at the first word that is refused."""
+        """Read consecutive words, at most MOST_WORDS. The read stops at the first word that the hardware refuses."""
         answer = self._execute("r", address, count, ACCESS_CLOCKS * count)
         if len(answer.words) != 4 * count and not (answer.response and len(answer.words) < 4 * count):
             self._fail("answered a read with another number of words")

@@ -1,1 +1,1 @@
-"""Boards in the services: processes of emulated boards, the boards of a deployment, their frames and results."""
+"""Boards as the services use them: processes of emulated boards, and the frames that a deployment's boards compute."""

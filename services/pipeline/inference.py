@@ -1,4 +1,4 @@
-"""The posterior for the results of a frame, and the report of the frame."""
+"""A frame's posterior, computed from the results of the boards, and the frame's report."""
 
 from machines.kind import Inference
 from posteriors.frame_report import BoardReport, FrameReport, StageTimes, VariableReading
@@ -8,7 +8,7 @@ from toolchain.deployment import Deployment
 
 
 def infer(result: FrameResult, deployment: Deployment) -> Inference:
-    """Return the posterior for the results of all boards, computed as their kind of machine requires."""
+    """Compute the posterior from the results of all boards, as the deployment's kind of machine requires."""
     machine = deployment.machine
     return machine.kind.infer(decode_boards(result), machine.variables)
 
@@ -23,8 +23,8 @@ def report_of(
 ) -> FrameReport:
     """Return the report of a frame.
 
-    `now` is the Unix time and the monotonic time, in ns; `previous_out_ns` is the time that sending the previous
-    result took.
+    `now` is the present time in ns, as (Unix time, monotonic time). `previous_out_ns` is the duration in ns of sending
+    the previous result.
     """
     result = publish.result
     sent_ns, tick = now

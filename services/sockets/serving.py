@@ -32,9 +32,9 @@ from toolchain.deployment import Deployment, load_deployment
 from toolchain.errors import ToolchainError
 
 GREETING_TIME = 5.0
-"""Seconds in which a client must send its hello; afterwards, another client may connect."""
+"""If a client sends no hello for this many seconds, the service disconnects it, so that another client can connect."""
 MAX_UNSAID = 4
-"""Maximum number of notices that are stored for the next master; the oldest are dropped."""
+"""Maximum number of notices that are stored for the next master. Further notices replace the oldest."""
 _REPORT_ATTEMPTS = 100
 _REPORT_INTERVAL = 0.02
 
@@ -43,26 +43,26 @@ class Link(Protocol):
     """The connection of a service to its master: over a local socket, or inside the same process."""
 
     masters: int = 1
-    """Number of masters that have greeted so far."""
+    """Number of masters that have sent their hello so far."""
 
     @property
     def has_master(self) -> bool:
-        """True while a master is connected and has greeted."""
+        """True while a master is connected and has sent its hello."""
 
     @property
     def backlog(self) -> int:
-        """Bytes that the master has not taken yet."""
+        """Number of sent bytes that the master has not read yet."""
         return 0
 
     def send(self, record: Record) -> bool:
-        """Send a record; return whether a master is connected."""
+        """Send a record to the master. Return False if no master is connected."""
 
     def keep(self, record: Record) -> None:
-        """Send a lasting state, such as readiness, now and to every master that connects later."""
+        """Send a lasting state, such as readiness, now. Send it again to every master that connects later."""
         self.send(record)
 
     def notice(self, level: str, sentence: str) -> None:
-        """Send a message for the user that does not end the run."""
+        """Send the master a message for the user. The run continues."""
         self.send(Notice(level, sentence))
 
     async def __aenter__(self) -> Self:
@@ -74,14 +74,14 @@ class Link(Protocol):
 
 
 MakeLink = Callable[[Callable[[AnyRecord], None]], Link]
-"""Function that creates a service's link, given a function for the master's records after its hello."""
+"""Function that creates a service's link. The link passes the records that follow a master's hello to the argument."""
 
 
 class MasterLink(Link):
     """A link that listens on a local socket for a master, and passes the master's records on.
 
-    A second master is refused until the first has disconnected. If the deployment folder of the service has changed
-    since its start and a master requires the new deployment, the service ends with an error.
+    A second master is refused until the first has disconnected. If the deployment folder has changed since the
+    service started, and a master requires the new deployment, the service ends with an error.
     """
 
     def __init__(
@@ -181,25 +181,25 @@ class MasterLink(Link):
 
     @property
     def has_master(self) -> bool:
-        """True while a master is connected and has greeted."""
+        """True while a master is connected and has sent its hello."""
         return self._master is not None and self._greeted
 
     @property
     def backlog(self) -> int:
-        """Bytes that the master has not taken yet."""
+        """Number of sent bytes that the master has not read yet."""
         return 0 if self._master is None else self._master.backlog
 
     def send(self, record: Record) -> bool:
-        """Send a record; return whether a master is connected."""
+        """Send a record to the master. Return False if no master is connected."""
         return self._master is not None and self._greeted and self._master.send(record)
 
     def keep(self, record: Record) -> None:
-        """Send a lasting state, such as readiness, now and to every master that connects later."""
+        """Send a lasting state, such as readiness, now. Send it again to every master that connects later."""
         self._last[type(record)] = record
         self.send(record)
 
     def notice(self, level: str, sentence: str) -> None:
-        """Send a message for the user, or store it for the next master: a service may start before its master."""
+        """Send the master a message for the user. If no master is connected, store the message for the next master."""
         if not self.send(record := Notice(level, sentence)):
             self._unsaid.append(record)
 
@@ -224,7 +224,7 @@ def listening(
 
 
 class RunService(ABC):
-    """A service of a run, which works for one master at a time through its link, and reports its status."""
+    """A service of a run. The service works for one master at a time through a link, and reports its status."""
 
     role: ClassVar[str]
 
@@ -276,7 +276,7 @@ async def report_failure(link: Link, error: BaseException) -> None:
 
 
 def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None:
-    """Return an error that advises a restart if the folder now has the deployment of the `refused` hello, else None."""
+    """Return an error that advises a restart, or None if the folder lacks the deployment that the hello requires."""
     if not isinstance(refused, Hello) or refused.deployment_hash == deployment.hash:
         return None
     try:
@@ -292,7 +292,7 @@ def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None
 
 
 def endpoint_from(text: str, flag: str) -> Endpoint:
-    """Return the endpoint that a user gave to `flag`, or raise a SettingsError."""
+    """Parse the endpoint that a user gave to a flag, or raise a SettingsError that names the flag."""
     try:
         return parse_endpoint(text)
     except PcieShimError as error:
@@ -300,7 +300,7 @@ def endpoint_from(text: str, flag: str) -> Endpoint:
 
 
 def deployment_for(settings: Settings, *, images: bool = False) -> Deployment:
-    """Return the deployment in the settings.
+    """Load the deployment that the settings name. With `images`, also read and check its images.
 
     Raises:
         SettingsError: The settings do not name a deployment.

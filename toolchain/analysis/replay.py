@@ -2,9 +2,9 @@
 
     recording ──rows──▶ addresses ──▶ Replay (a job: one piece per frame) ──▶ OUT.frames ──▶ OUT.npz or OUT.mcap
 
-`OUT.frames` begins with a line that identifies everything on which the results depend. After it, each frame has a place
-for its record, so that a killed run can be resumed. `OUT` is written in the order of the rows, so its bytes do not
-depend on which process computed a frame, or when.
+`OUT.frames` begins with a line that identifies everything on which the results depend. After this line, the file has
+room for the record of each frame. So a killed run can be resumed. `OUT` is written in the order of the rows. Its bytes
+therefore do not depend on which process computed a frame, or when.
 """
 
 import fcntl
@@ -69,7 +69,7 @@ def _run_on(deployment: Deployment, machines: Sequence[Any], readings: Readings)
 
 @dataclass(frozen=True, slots=True)
 class Replay:
-    """The `toolchain.cluster.Job` that computes a recording's frames: piece n is row n, a master's frame n + 1."""
+    """The `toolchain.cluster.Job` that computes the frames of a recording. Piece n is row n of the recording."""
 
     deployment: Deployment
     machines: Sequence[Any]
@@ -82,7 +82,7 @@ class Replay:
 
     @property
     def is_sequence(self) -> bool:
-        """True if a frame depends on those before it, because of a filter or of generators that are never reset."""
+        """True if each frame depends on earlier frames, because of a filter or of generators that are never reset."""
         section = self.deployment.machine
         return self.deployment.filter is not None or section.rng_reset is RngReset.FREE
 
@@ -113,22 +113,22 @@ class Replay:
 
 
 def record_layout(deployment: Deployment) -> "np.dtype[np.void]":
-    """Return the layout of a record: checksum of the rest, cycles of the longest-running board, posterior or NaN."""
+    """Return the layout of a record: checksum of the other fields, cycles of the longest-running board, posterior."""
     return np.dtype([("crc", "<u8"), ("cycles", "<u8"), ("posterior", "<f8", deployment.machine.results)])
 
 
 @dataclass(slots=True)
 class PartFile:
-    """A file with one record per row of the recording; an interrupted run may have written some of the records."""
+    """A file with room for one record per row of a recording. An interrupted run leaves some records in the file."""
 
     file: int
     """The descriptor of the file."""
     begin: int
     """Offset of the first record in bytes."""
     records: NDArray[np.void]
-    """All records, mapped from the file, so that those which `add` writes later appear here too."""
+    """All records, memory-mapped from the file. Records that `add` writes later appear in this array too."""
     there: bytearray
-    """For each row, 1 if its record is in the file."""
+    """One byte per row: 1 if the record of the row is in the file, else 0."""
     written: int = 0
     """Number of rows that `ready` has yielded."""
 
@@ -171,14 +171,14 @@ class PartFile:
         self.there[row] = 1
 
     def earlier(self, row: int) -> tuple[_Posterior, int] | None:
-        """Return the posterior and cycles of a row, or None if its record is not in the file."""
+        """Return the posterior, if any, and the cycles of a row, or None if the file lacks the row's record."""
         if not self.there[row]:
             return None
         posterior: NDArray[np.float64] = np.array(self.records[row]["posterior"])
         return None if math.isnan(posterior[0]) else posterior, int(self.records[row]["cycles"])
 
     def ready(self) -> Iterator[NDArray[np.void]]:
-        """Yield the next records in the order of their rows, up to the first row without a record."""
+        """Yield new batches of records in the order of the rows, up to the first row without a record."""
         rows = len(self.records)
         gap = self.there.find(0, self.written) % (rows + 1)  # -1, for none, becomes the number of rows
         while self.written + _TOGETHER <= gap or self.written < gap == rows:
@@ -197,12 +197,12 @@ def replay(
 ) -> tuple[int, int]:
     """Compute all frames that an interrupted run has not computed, and write the output.
 
-    `begun` is called with the number of frames that the interrupted run computed, and `advance` after each further one.
-    The frames of a sequence are computed in this process. Return the number of frames computed now, and the number of
-    all frames without a posterior.
+    First, `begun` is called with the number of frames from the interrupted run. After each further frame, `advance` is
+    called. If a frame depends on earlier frames, this process computes all frames. Return the number of frames computed
+    now, and the number of all frames without a posterior.
 
     Raises:
-        BuildError: A file cannot be written, or is that of another recording, deployment or version.
+        BuildError: A file cannot be written, or belongs to another recording, deployment or version.
     """
     job = Replay(deployment, [image.machine for image in read_images(deployment)], frames)
     path, layout = output.with_name(output.name + ".frames"), record_layout(deployment)
@@ -310,7 +310,7 @@ _WRITERS: Final = {".npz": _archive, ".mcap": _bag}
 
 
 def check_request(path: Path, deployment: Deployment) -> None:
-    """Raise a BuildError, before a long run, if the output cannot be written or the deployment reads arrays."""
+    """Before a long run, raise a BuildError if the output `path` is unusable or the deployment reads arrays."""
     if not deployment.machine.is_plain or deployment.prior is not None:
         raise BuildError(
             f"{deployment.directory} reads arrays of numbers (for each line or replica, or a prior), but the columns of a "

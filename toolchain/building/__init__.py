@@ -1,1 +1,1 @@
-"""The stages from a model to a deployment: parameters, codes, each board's lines, images, files (thesis 3.2, 3.4)."""
+"""The stages of a build, from the parameters and codes of a model to the files of a deployment (thesis 3.2, 3.4)."""

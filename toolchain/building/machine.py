@@ -1,4 +1,4 @@
-"""The BM1 for a model: its plan, which board has which lines, and the boards' registers (thesis 3.4, 4.2)."""
+"""The BM1 for a model: its parameters, the lines of each board, and the size of the registers (thesis 3.4, 4.2)."""
 
 import math
 import re
@@ -29,11 +29,14 @@ _MOST_CODES: Final = 1 << 30
 MACHINE_KEYS: Final = tuple(
     key for key in BM1Section.model_fields if key in BM1Parameters.__dataclass_fields__ and key != "lines"
 )
-"""Fields of BM1Parameters that are also keys of `[machine]`, except `lines`, whose key counts all boards' lines."""
+"""Keys of `[machine]` that are also fields of BM1Parameters, except `lines`.
+
+In `[machine]`, `lines` counts the lines of all boards.
+"""
 
 
 def machine_options(source: BuildOptions | MachineSection, keys: Iterable[str]) -> dict[str, Any]:
-    """Return the values that `source` has for those of `keys` that are build options, without values of None."""
+    """Return the values of `keys` in `source`. Omit a key if it is not a build option, or if its value is None."""
     options = [key for key in keys if key in BuildOptions.__dataclass_fields__]
     return {key: value for key in options if (value := getattr(source, key)) is not None}
 
@@ -49,18 +52,18 @@ def option(key: str, options: BuildOptions, section: type[BM1Section | BM2Sectio
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MachinePlan:
-    """The BM1 for a model, before any table is computed."""
+    """The parameters and options of the BM1 for a model, decided before any table is computed."""
 
     kind: ClassVar = "BM1"
     why: ClassVar = "the known variables are independent given the searched ones"
-    """The reason for a BM1, as a clause."""
+    """The reason why the build chooses a BM1, as a clause of a sentence."""
     model: Model
     options: BuildOptions
-    """The options of the build; `fit_to_device` may still change the numbers of boards and replicas."""
+    """The options of the build. Later, `fit_to_device` may change the numbers of boards and replicas."""
     parameters: BM1Parameters
     """The parameters of the whole machine, with the lines of all boards."""
     target_count: int
-    """The count of a line that stops the machine."""
+    """The machine stops when the count of a line reaches this number."""
     max_cycles: int
     """The maximum number of cycles of a frame."""
 
@@ -73,7 +76,7 @@ class MachinePlan:
 
 
 def with_bits(model: Model, bits: Iterable[str]) -> Model:
-    """Return the model with address bits of some columns, given as `NAME=BITS`, or raise a BuildError."""
+    """Return the model with the numbers of address bits in `bits` (each is `NAME=BITS`), or raise a BuildError."""
     widths = key_values(bits, "--bits", "range=8")
     names = [variable.name for variable in model.variables]
     for name, text in widths.items():
@@ -87,7 +90,7 @@ def with_bits(model: Model, bits: Iterable[str]) -> Model:
 
 
 def plan_machine(model: Model, options: BuildOptions) -> MachinePlan:
-    """Derive the parameters of the machine for the whole model, or raise a BuildError if an option contradicts it."""
+    """Return the plan of the machine for the whole model, or raise a BuildError if the options do not fit the model."""
     if model.transition is not None:
         options = _filter_options(options)
     if options.sensor_mode is not SensorMode.COLUMN and options.scaling is Scale.ADDRESS:
@@ -152,7 +155,7 @@ def _filter_options(options: BuildOptions) -> BuildOptions:
 
 
 def whole_machine(plan: MachinePlan, quantised: Quantised) -> BM1Machine:
-    """Return the machine with all lines of a model, or raise a BuildError."""
+    """Return the undivided machine, which has all lines of the model, or raise a BuildError."""
     parameters, table = plan.parameters, plan.options.rng_table
     if table is None and parameters.rng is RngKind.TABLE:
         table = random_table(parameters.prob_bits)
@@ -164,7 +167,7 @@ def whole_machine(plan: MachinePlan, quantised: Quantised) -> BM1Machine:
 
 @dataclass(frozen=True, slots=True)
 class LineBlock:
-    """The lines of one board: `lines` of them from `offset` on."""
+    """The lines of one board: the first line has the index `offset`, and the board has `lines` lines."""
 
     offset: int
     lines: int
@@ -176,7 +179,7 @@ class LineBlock:
 
 
 def partition_lines(lines: int, count: int) -> tuple[LineBlock, ...]:
-    """Divide `lines` lines among boards, in order, or raise a BuildError; the first boards may get one line more."""
+    """Divide lines in order among `count` boards, or raise a BuildError. The first boards may get one more line."""
     if not 1 <= count <= lines:
         raise BuildError(
             f"{lines} lines cannot be divided among {count} boards: expected 1 to {lines} partitions"
@@ -209,14 +212,14 @@ _MOST_SEEDS: Final = 1 << 23
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BoardLayout:
-    """The lines of each board, and the size of the register interface, which is the same for all boards."""
+    """The lines of each board, and the size of the register interface. The size is the same for all boards."""
 
     blocks: tuple[LineBlock, ...]
-    """The block of lines of each board; none is larger than the first."""
+    """The block of lines of each board. No block is larger than the first."""
     interface: tuple[int, int]
-    """Numbers of input and result words of a board's registers."""
+    """Number of input words and number of result words in a board's registers."""
     reason: str
-    """The reason for the size of the interface, as a clause."""
+    """The reason for the size of the interface, as a clause that follows the size."""
 
 
 def board_layout(
@@ -248,9 +251,10 @@ def fitted_layout(
     what: str,
     advice: str = "",
 ) -> BoardLayout:
-    """Return the layout of boards, or raise a BuildError if the registers that a board uses don't fit the interface.
+    """Return the layout of boards, or raise a BuildError if the boards, interface and register map do not fit.
 
-    `asked` is the interface asked for; None fits it to `used`. `what` describes a board, and `advice` ends the error.
+    `asked` is the size that the user wants. If `asked` is None, the interface gets the size that `used` needs. In
+    errors, `what` describes a board. If a board does not fit the register map, the error ends with `advice`.
     """
     needed, room = (used.input_words, used.result_words), interface_room(used)
     sentence = f"a board needs {counted(needed[0], 'input')} and {counted(needed[1], 'result')} ({what})"
@@ -272,7 +276,7 @@ def fitted_layout(
 
 
 def size_text(size: tuple[int, int]) -> str:
-    """Return the size of an interface as in `deployment.toml`."""
+    """Return the size of an interface as the text in `deployment.toml`, for example `20x1200`."""
     return f"{size[0]}x{size[1]}"
 
 
@@ -296,7 +300,7 @@ def _advice(parameters: BM1Parameters, used: UsedRegisters) -> str:
 
 
 def check_seeds(board: BM1Parameters | BM2Parameters, advice: str = "") -> None:
-    """Raise a BuildError, which ends with `advice`, if a board has too many seeds."""
+    """Raise a BuildError if a board has too many seeds. The error ends with `advice`."""
     generators = math.prod(board.generator_shape)
     seeds = board.rng_banks * generators
     if seeds > _MOST_SEEDS and board.rng is not RngKind.IDEAL:

@@ -1,8 +1,8 @@
-"""Conditional distributions P(K | S): normals over the bins of a reading, wrapped for bearings.
+"""Conditional distributions P(K | S) of a reading K, given the searched variables S: normals, or wrapped normals.
 
-The address of a reading is the index of its bin, which extends half a step to each side of the bin's centre. A bin's
-probability is the integral of the normal over the bin, not the density at the centre, so coarse bins are exact too.
-The lines of a table are the values of S.
+Wrapped normals are for bearings. The address of a reading is the index of its bin. A bin extends half a step to each
+side of its centre. A bin's probability is the integral of the normal over the bin, not the density at the centre. So
+coarse bins are exact too. The lines of a table are the values of S.
 """
 
 import math
@@ -21,7 +21,7 @@ _UNIFORM: Final = 2.0
 
 
 def normal_table(name: str, shape: Normal, *, values: int, offset: float, step: float) -> NDArray[np.float64]:
-    """Return P(K | S) of a normal over bins, float64[values, lines]; the end bins include the tails."""
+    """Return P(K | S) for normals over `values` bins, float64[values, lines]. The outermost bins include the tails."""
     mean, sigma = _checked(name, shape, values, step)
     inner = offset + (np.arange(1, values) - 0.5) * step
     edges = np.concatenate(([-np.inf], inner, [np.inf]))[:, np.newaxis]
@@ -34,7 +34,7 @@ def normal_table(name: str, shape: Normal, *, values: int, offset: float, step: 
 def wrapped_normal_table(
     name: str, shape: Normal, *, values: int, offset: float, step: float
 ) -> NDArray[np.float64]:
-    """Return P(K | S) of a wrapped normal over a turn of `values` bins, float64[values, lines]."""
+    """Return P(K | S) for wrapped normals, float64[values, lines]. Together, the `values` bins are one turn."""
     mean, sigma = _checked(name, shape, values, step)
     turn = values * step
     sigma = np.minimum(sigma, _UNIFORM * turn)
@@ -100,7 +100,7 @@ def _mass(
 
 
 def middle_bin(bin_in_sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the probability that a normal distribution gives to a bin centred at its mean."""
+    """Return the probability of the bin at a normal's mean. `bin_in_sigmas` is the width of the bin over sigma."""
     return 1 - 2 * _upper_tail(bin_in_sigmas / 2)
 
 
