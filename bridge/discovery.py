@@ -1,8 +1,8 @@
 """Discovery of rosbridge servers on the local network by multicast DNS, as in Bonjour and Avahi.
 
 A server announces itself as an instance of the service `_rosbridge._tcp.local.`, under the name of the robot.
-Its properties are `path` of the URL, `tls`, `token` and `ros` (1 or 2). All properties are optional, so a line in the
-configuration of Avahi is sufficient to announce a rosbridge server.
+The properties of the service are `path` of the URL, `tls`, `token` and `ros` (1 or 2). All properties are optional, so
+a line in the configuration of Avahi is sufficient to announce a rosbridge server.
 
 The package `zeroconf` is optional (`pip install zeroconf`). The functions of this module import it when called.
 Data from the network is not trusted: its amount is limited, and announcements with unprintable names are ignored.

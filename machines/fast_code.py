@@ -174,7 +174,7 @@ def image(maps: Words, which: int, state: np.uint64) -> np.uint64:
 
 @jit
 def jump(jumps: Words, states: Words, clocks: int, later: Words) -> None:
-    """Advance the states by a number of clocks, with at most a state's number of bits; store the result in `later`."""
+    """Advance each state by a number of clocks below 2**(state bits), and store the new states in `later`."""
     for column in range(states.shape[0]):
         state = states[column]
         for bit in range(jumps.shape[0]):

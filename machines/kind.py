@@ -225,7 +225,7 @@ class FrameCourse(ABC):
     def proceed(
         self, reasons: Sequence[Sequence[int]], answers: Sequence[memoryview]
     ) -> tuple[Sequence[int], Blocks]:
-        """Return the numbers of the boards to resume, and the blocks to write first. When the frame ends, there are none.
+        """Return the numbers of the boards to resume, or none if the frame is over, and the blocks to write first.
 
         For each board, `reasons` has the last stop reasons of its replicas, and `answers` has the words of the blocks
         in `UsedRegisters.answer`. A board's words are valid until the board is resumed.

@@ -51,7 +51,7 @@ class Posterior:
     each of them sums to 1. If all counts of a replica are 0, its probabilities are 0.
     """
     labels: tuple[str, ...]
-    """Names of the dimensions: the searched variables, and first `replica` if there are several replicas."""
+    """Names of the dimensions: those of the searched variables, after `replica` if there are several replicas."""
     sizes: tuple[int, ...]
     """Number of values of each dimension."""
     heard_ns: int

@@ -39,7 +39,7 @@ If the process exits once more in this time, its parent ends with an error.
 
 
 def describe_exit(code: int | None) -> str:
-    """Return a predicate that describes an exit code, such as `was killed by SIGTERM`."""
+    """Return a text that describes an exit code, such as `was killed by SIGTERM`."""
     if code is not None and code < 0:
         try:
             return f"was killed by {signal.Signals(-code).name}"
@@ -220,7 +220,7 @@ class Child:
                 pipe.read(last=True)
 
     def failure(self) -> StackError:
-        """Return the process's exit as an error. Its text is the reported error, or else describes the exit code."""
+        """Return the process's exit as an error. The error has the reported text, or else describes the exit code."""
         code = self.exit_code
         # the exit code of an error decides whether a restart would help, so it must not be lost
         if self._error:

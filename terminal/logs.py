@@ -47,7 +47,7 @@ class LogFormat(StrEnum):
 
 
 def log_format() -> LogFormat:
-    """Return the current log format. If the environment variable is invalid, return text; the settings report it."""
+    """Return the current log format, or `TEXT` if the environment variable is invalid. The settings report the error."""
     value = os.environ.get(FORMAT_VARIABLE, "")
     return LogFormat(value) if value in set(LogFormat) else LogFormat.TEXT
 
@@ -173,7 +173,7 @@ def get_logger(role: str, level: str = "info") -> Logger:
 
 
 def log_libraries(level: int, form: str) -> None:
-    """Write libraries' log records of at least `level` to standard error. `form` is a format of `logging`."""
+    """Write libraries' log records of at least `level` to standard error, in the `logging` format `form`."""
     handler = logging.StreamHandler()
     handler.setFormatter(_OneLine(form))
     logging.basicConfig(level=level, handlers=[handler])

@@ -65,7 +65,7 @@ SWITCHES: Final = {
     },
     **{f"{name}/plugged": (f"{name} is plugged in", f"{name} is unplugged") for name in SENSOR_NAMES},
 }
-"""The switches by name, each with a sentence for on and for off. A switch is a service below `/boat/`, at first on."""
+"""The switches by name, each with a sentence for on and for off. Switches are services below `/boat/`, at first on."""
 _SWITCH_TYPE = "std_srvs/SetBool"
 _SHORE = 2.0  # waypoints are at least this far from the map's edge
 # Minimum number of seconds before a change causes another reading: a mouse moves 1000 times a second.

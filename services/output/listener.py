@@ -30,9 +30,9 @@ async def show_frames(
     show: Show,
     file: ResultFile | None,
 ) -> int:
-    """Show and save frames until `count` posteriors have arrived. None stands for any number of posteriors.
+    """Show and save frames until `count` posteriors have arrived. If `count` is None, continue without end.
 
-    `silence` is the maximum number of seconds between two frames, or None for no limit.
+    After the first frame, at most `silence` seconds may pass between two frames. None stands for no limit.
 
     Raises:
         NoResultError: No frame arrived in time.

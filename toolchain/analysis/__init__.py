@@ -27,9 +27,9 @@ Clock: TypeAlias = Annotated[
 ]
 DeviceName: TypeAlias = Annotated[str, typer.Option(help="FPGA of the boards.", metavar="proce-v-d8")]
 Progress: TypeAlias = Callable[[int], AbstractContextManager[Callable[[str], None]]]
-"""Type of a function that opens a progress bar for a number of steps.
+"""Function that returns the context of a progress bar for a number of steps.
 
-The context yields a function. The caller calls this function after each step, with the text to show.
+The context yields a function to call after each step, with the text to show.
 """
 
 _Member = TypeVar("_Member", bound=StrEnum)

@@ -48,7 +48,7 @@ class MachineAnswer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
-    """The joint posterior of the searched variables. Its lines are ordered with the first variable varying slowest."""
+    """The joint posterior of the searched variables. In the order of its values, the first variable varies slowest."""
 
     network: str
     searched: tuple[Symbol, ...]

@@ -39,7 +39,7 @@ class Recording:
     columns: dict[str, list[object]]
     """For each column name, the values of all rows. A value is a number, a text, or None if it is missing."""
     stamps: tuple[int, ...] = ()
-    """The time of each row in nanoseconds. Empty for a CSV file, unless `read_recording` read its time column."""
+    """The time of each row in nanoseconds. For a CSV file, there are times only if its time column was read."""
 
 
 def read_recording(

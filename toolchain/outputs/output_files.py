@@ -184,7 +184,7 @@ def text_file(name: str, text: str) -> OutputFiles:
 
 
 def write_files(directory: Path, *parts: OutputFiles) -> list[tuple[str, Change]]:
-    """Write the parts' files one after the other, each atomically. Return each file's path and change, by path."""
+    """Write the parts' files one after the other, each atomically. Return the path and change of each file, sorted."""
     changes: dict[str, Change] = {}
     for part in parts:
         changes |= {name: _write(directory / name, pieces) for name, pieces in part.contents.items()}

@@ -258,7 +258,7 @@ class ServedServices(_Served):
 
 
 class ServedActions(_Served):
-    """The actions that this client offers, and the goals that it executes. Goals have the ids of the wire protocol."""
+    """The actions that this client offers, and the goals that it executes. Goals are stored by their ids."""
 
     kind = "action"
 
