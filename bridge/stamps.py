@@ -52,7 +52,10 @@ def header_stamp_ns(msg: Mapping[str, Any]) -> int | None:
 
 
 def ros_version_of_message(msg: Mapping[str, Any]) -> Literal[1, 2] | None:
-    """Return the ROS version that the keys of `header.stamp` show, or None if no or both versions' keys are there."""
+    """Return the ROS version that the keys of a message's `header.stamp` show.
+
+    Returns None if the stamp is missing, or if it has the keys of both versions.
+    """
     head = msg.get("header")
     time = head.get("stamp") if isinstance(head, Mapping) else None
     if not isinstance(time, Mapping) or ("sec" in time) == ("secs" in time):

@@ -101,7 +101,7 @@ def projected_shares(instances: Iterable[Instance], clock_hz: float) -> tuple[St
 
 
 def mean_link_us(instances: Iterable[Instance], rate: str) -> float:
-    """Return the mean time of a frame's transfers on a link of this `--link-rate` in us, or 0 if it is not reported."""
+    """Return a frame's mean transfer time in us at the link rate `rate`, or 0 if the frames do not report transfers."""
     return sum(share.mean_us for share in _shares(instances, (("", StageKind.REGISTERS, _link_us(rate)),)))
 
 

@@ -21,7 +21,7 @@ _Unsigned = Annotated[int, msgspec.Meta(ge=0, le=2**63 - 1)]  # a record has no 
 
 
 class LineReading(msgspec.Struct):
-    """A reading: from `subscriber --deployment` to `pcie-app`."""
+    """A reading, sent from `subscriber --deployment` to `pcie-app`."""
 
     addresses: Addresses
     stamp_ns: int | None = None

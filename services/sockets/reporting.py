@@ -4,7 +4,7 @@
                           ──▶ NOTIFY_SOCKET      readiness, and signs of life
                           ──▶ --metrics          HTTP for Prometheus
 
-Processing a frame only updates counters. The rest is done once a second, or when a status is requested.
+Processing a frame only updates counters. Other work is done once a second, or when a status is requested.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Advice on whether to answer a question with a BM1, a BM2 or exact inference on a CPU (thesis 5.2).
 
 Both machines are emulated on readings drawn from the model. Frames are lengthened until the mean total variation from
-exact inference is small enough. If a machine does not reach the accuracy asked for within `MOST_CYCLES` cycles, the
+exact inference is small enough. If a machine does not reach the requested accuracy within `MOST_CYCLES` cycles, the
 advice gives the total variation reached, and the reason why it is no smaller.
 """
 

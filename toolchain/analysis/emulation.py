@@ -20,7 +20,7 @@ Inputs: TypeAlias = "tuple[int, ...] | NDArray[np.int64]"
 """Inputs of a frame: for each sensor column, the address of the reading in the column's table. If each line has its
 own readings, the inputs are an array int64[sensors, lines of all boards]."""
 WrittenPrior: TypeAlias = "NDArray[np.uint16] | None"
-"""Codes of a prior that the host writes for a frame, uint16[lines of all boards], or None to use the built prior."""
+"""Codes of a prior that the host writes for a frame, uint16[lines of all boards]. None selects the machines' prior."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,9 +87,10 @@ class EmulatedBoards:
         return self.machines[0].parameters
 
     def parts(self, inputs: Inputs, prior: WrittenPrior) -> Iterator[tuple[Inputs, WrittenPrior]]:
-        """Return the inputs of each board in a frame, with the board's part of a written prior or None.
+        """Return a pair for each board: the board's inputs of a frame, and its part of the written prior.
 
         If each line has its own readings, the inputs are split among the boards. Otherwise each board gets all inputs.
+        If `prior` is None, the part is None.
         """
         count, ends = len(self.machines), self._ends
         of_boards = [inputs] * count if isinstance(inputs, tuple) else np.split(inputs, ends, axis=1)
@@ -163,7 +164,7 @@ def addressed_chances(
 
 
 def one_replica(machine: BM1Machine) -> BM1Machine:
-    """Return `machine` with a single replica. Its counts are those of each replica with the same inputs."""
+    """Return `machine` with a single replica. For equal inputs, its counts are those of any replica of `machine`."""
     return replace(machine, parameters=replace(machine.parameters, replicas=1))
 
 

@@ -23,7 +23,7 @@ class Severity(StrEnum):
     ERROR = "error"
     """The model cannot be built, or computes wrong results."""
     WARNING = "warning"
-    """Some readings get no posterior or a wrong one, or resources are wasted."""
+    """Some readings get no posterior or a wrong posterior, or resources are wasted."""
     NOTE = "note"
     """Nothing is wrong if this is intended."""
 

@@ -192,7 +192,7 @@ class Symbol:
         return self.type.size if self.type.wraps else None
 
     def values(self) -> NDArray[np.float64]:
-        """Return its values as numbers, float64[size]."""
+        """Return the symbol's values as numbers, float64[size]."""
         values: NDArray[np.float64] = self.type.offset + np.arange(self.size) * np.float64(self.type.step)
         return values
 
@@ -246,7 +246,7 @@ class Symbol:
 
 
 Formula: TypeAlias = Callable[..., ArrayLike] | ArrayLike
-"""Constant numbers, or a function of the parents' values. The function gets a float64 array for each parent."""
+"""Constant numbers, or a function. The function gets the values of each parent as float64 arrays of equal shape."""
 
 _SUM_TOLERANCE: Final = 1e-6
 

@@ -208,7 +208,7 @@ _SHOWN: Final = 4
 
 
 class Links:
-    """Links between symbols that share a factor. Symbols in `cut` are searched or have a fixed value, and are left out.
+    """Links between symbols that share a factor. The searched and the fixed symbols, named in `cut`, are left out.
 
     Symbols in different components are independent, given the symbols in `cut` (moral graph criterion).
     """
@@ -287,7 +287,7 @@ class Links:
 
 
 def relevant(factors: Iterable[Factor], asked: set[str]) -> list[Factor]:
-    """Remove the distributions that sum to 1 without changing the answer, and return the remaining factors.
+    """Return the factors without the distributions that cannot change the answer, because they sum to 1.
 
     A distribution is removed if its symbol is not in `asked` and is in no other remaining factor.
     """

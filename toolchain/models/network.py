@@ -1,7 +1,7 @@
 """The network that a BM2 samples: the relevant factors of a question and their symbols (thesis 2.1.3).
 
-Known symbols remain variables, because a reading may be missing. The tables contain a given symbol only at its value.
-If a symbol changes no answer, because its distribution sums to 1, it is left out.
+Known symbols remain variables, because a reading may be missing. Each given symbol is fixed at its value in the tables.
+A symbol is left out if it cannot change the answer because its distribution sums to 1.
 """
 
 import math
@@ -27,8 +27,8 @@ class NetworkModel:
     symbols: tuple[Symbol, ...]
     """The variables of the machine, in the order of the joint distribution."""
     factors: tuple[Term, ...]
-    """The factors. Each has a conditional distribution encoder (CDE) of its own in the machine. The names in a scope are in
-    the order of `symbols`.
+    """The factors, each for one conditional distribution encoder (CDE) of the machine. The names in a factor's scope are
+    in the order of `symbols`.
     """
     titles: tuple[str, ...]
     """The name of each factor, such as P(A | B)."""
@@ -61,10 +61,10 @@ class NetworkModel:
         return math.prod(each.size for each in self.searched)
 
     def exact(self, addresses: Sequence[int | None]) -> NDArray[np.float64]:
-        """Return the exact joint posterior of the searched variables, float64[lines]. The first varies slowest.
+        """Return the exact joint posterior of the searched variables, float64[lines].
 
-        `addresses` has an address for each known variable, or None for a missing reading. Raises a ModelError if the
-        readings have the probability 0, or if inference needs a table above the limit.
+        The first variable varies slowest. `addresses` has an address for each known variable, or None for a missing
+        reading. Raises a ModelError if the readings have the probability 0, or if a table would exceed the limit.
         """
         asked = [each.label for each in self.searched]
         sizes = dict(zip(self.names, self.cardinalities, strict=True))
