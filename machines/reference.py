@@ -13,10 +13,10 @@ from machines.rng import random_numbers
 
 
 class ReferenceBM1(BM1Kernel):
-    """A kernel for any machine that runs cycle by cycle (thesis 2.1.2, figure 2.4).
+    """A kernel that computes any BM1 cycle by cycle (thesis 2.1.2, figure 2.4).
 
-    In every cycle, all replicas use the same random numbers. Each compares them with its own codes, and
-    counts and stops by itself; the generators step until the last replica has stopped.
+    In every cycle, all replicas use the same random numbers. Each replica has its own codes and counters, and
+    stops independently of other replicas. The generators step until the last replica has stopped.
     """
 
     def __init__(self, machine: BM1Machine) -> None:
@@ -29,12 +29,12 @@ class ReferenceBM1(BM1Kernel):
 
     @property
     def counts(self) -> npt.NDArray[np.uint32]:
-        """A copy of the counters: uint32[lines], with several replicas uint32[replicas, lines]."""
+        """A copy of the counters: uint32[lines], or uint32[replicas, lines] with several replicas."""
         return self._counts.reshape(self.machine.parameters.count_shape).copy()
 
     @property
     def rng_state(self) -> npt.NDArray[np.uint64]:
-        """A copy of the generators' states: uint64[columns], or uint64[lines, columns] if unshared."""
+        """A copy of the generators' states: uint64[columns], or uint64[lines, columns] with a generator per cell."""
         return self._states.copy()
 
     def _reset(self) -> None:

@@ -3,9 +3,9 @@
     $XDG_RUNTIME_DIR/rosbayes, otherwise /tmp/rosbayes-UID    unless BM_RUN_DIRECTORY or --run-directory names one
         master.status.sock  subscriber.sock  board0.sock  ...
 
-Only this user can enter the default directory. A master that starts processes locks the directory (flock), and its
-children inherit the lock. So the kernel releases the lock when the last of these processes has ended, even if it was
-killed. The next start replaces the sockets of killed processes.
+Only this user can enter the default directory. A master that starts processes locks the run directory with flock. The
+child processes inherit the lock. The kernel releases the lock when the master and all child processes have ended, even
+after a kill. The next start replaces the sockets of killed processes.
 """
 
 import contextlib
@@ -25,13 +25,13 @@ _LONGEST_RUNTIME = 40
 
 
 class OccupiedError(Exception):
-    """The run directory is locked by another run, or by remaining processes of one that is ending."""
+    """Another run locks the run directory. The other run may already be ending."""
 
     exit_code = ExitCode.USAGE
 
 
 def default_run_directory() -> Path:
-    """Return the run directory of this user, which may not exist."""
+    """Return the path of this user's default run directory. The directory may not exist."""
     runtime = os.environ.get("XDG_RUNTIME_DIR", "")
     # the specification requires ignoring relative paths
     usable = Path(runtime).is_absolute() and len(os.fsencode(runtime)) < _LONGEST_RUNTIME
@@ -113,7 +113,7 @@ class LockedRunDirectory:
             ) from error
 
     def release(self) -> None:
-        """Remove the sockets that killed processes left in the directory, and unlock it."""
+        """Remove the sockets that killed processes left, and unlock the directory."""
         remove_stale_sockets(self.path)
         os.close(self.lock)
 

@@ -49,7 +49,7 @@ _Handler = Callable[[Client, Operation, float], None]
 
 
 class Broker:
-    """All clients of one hub, and everything between them."""
+    """The clients of one hub, and the topics, services and actions that connect them."""
 
     def __init__(
         self,
@@ -58,7 +58,7 @@ class Broker:
         ros_version: RosVersion = 1,
         wall_clock: Callable[[], int] = time.time_ns,
     ) -> None:
-        """Start without clients; `wall_clock` returns nanoseconds since 1970, for `/rosapi/get_time` and stamps."""
+        """Start without clients. `wall_clock` returns nanoseconds since 1970, for `/rosapi/get_time` and stamps."""
         self.limits = limits or HubLimits()
         self.graph = Graph()
         self.definitions = MessageDefinitions(ros_version, wall_clock)
@@ -66,7 +66,7 @@ class Broker:
         rosapi = Rosapi(self.graph, self.limits, self.definitions, wall_clock)
         self._dispatcher = Dispatcher(self.limits)
         self.take_ready = self._dispatcher.take_ready
-        """Returns the clients that have had output, or must be closed, since the last call."""
+        """Returns the clients marked as ready since the last call. Each has output, or must be closed."""
         self._topics = Topics(self.graph, self.limits, self._dispatcher, self.definitions, self._refuse)
         self._actions = Actions(self.graph, self.limits, self._dispatcher, self.definitions)
         self._calls = Calls(
@@ -102,16 +102,16 @@ class Broker:
 
     @property
     def full(self) -> bool:
-        """Return whether as many clients are connected as the limits allow."""
+        """True if the maximum number of clients is connected."""
         return len(self.graph.clients) >= self.limits.clients
 
     @property
     def deadline(self) -> float:
-        """Time at which to call `wake` next (monotonic seconds), infinity for never."""
+        """Time at which to call `wake` next, in monotonic seconds. Infinity means never."""
         return self._dispatcher.deadline
 
     def connect(self, address: str) -> Client:
-        """Admit a client from `address`; the caller must check `full` before."""
+        """Admit a client from `address`. The caller must first check that the hub is not `full`."""
         client = Client(
             next(self._client_numbers), address, Outbox(self.limits.client_bytes, self.limits.message_bytes)
         )
@@ -138,7 +138,7 @@ class Broker:
         self._reassembling.pop(client, None)
 
     def receive(self, client: Client, data: bytes, now: float) -> None:
-        """Perform the operation in a whole WebSocket message, text or binary; invalid content is refused."""
+        """Perform the operation in a whole WebSocket message, text or binary. An invalid operation is refused."""
         self._now, self._operation_id = now, None
         self._dispatcher.work += _OPERATION_WORK + (len(data) >> 7)
         try:
@@ -195,7 +195,7 @@ class Broker:
             handler(client, operation, now)
 
     def wake(self, now: float) -> None:
-        """Release messages that throttles admit at `now`, and end calls and incomplete messages that are too old."""
+        """Release messages that throttles admit at `now`, fail expired calls, and drop expired incomplete messages."""
         throttle_deadline = self._dispatcher.release(now)
         self._calls.expire(now)
         if now >= self._fragment_deadline:

@@ -1,7 +1,7 @@
-"""Fast reading and writing of WebSocket frames that contain a whole message each.
+"""Fast reading and writing of WebSocket frames that each contain a whole message.
 
-`whole_messages` finds them in the bytes of a socket. All other frames (control frames, fragments, malformed
-ones) are left to the sans-I/O protocol of `websockets`.
+`whole_messages` finds whole messages in the bytes of a socket. The sans-I/O protocol of `websockets` handles all other
+frames: control frames, fragments and malformed frames.
 
 Source: RFC 6455, sections 5.2, 5.3 and 10.3.
 """
@@ -88,9 +88,10 @@ def whole_messages(
 
 
 def only_message(data: bytes, *, masked: bool, largest: int) -> bytes | None:
-    """Return the payload if the data is exactly one single-frame message, otherwise None.
+    """Return the payload if the data is exactly one single-frame message of usual size, otherwise None.
 
-    It does the same as `whole_messages`, faster, in the most frequent case.
+    The function is faster than `whole_messages`. It reads no messages of 64 KiB or more, and no data of less than
+    8 bytes.
     """
     size = len(data)
     if size < _LONGEST_HEADER or data[0] not in _WHOLE:
@@ -133,7 +134,7 @@ def frame_end(data: bytes, at: int, *, masked: bool, largest: int) -> int:
 
 
 def unmasked(payloads: Sequence[bytes]) -> bytes:
-    """Return a server's frames (not masked) for whole messages: text frames for JSON objects, binary ones for CBOR."""
+    """Return a server's unmasked frames, one for each message: text frames for JSON objects, binary frames for CBOR."""
     parts: list[bytes] = []
     for payload in payloads:
         headers = _TEXT_HEADERS if payload[0] == _BRACE else _BINARY_HEADERS
@@ -142,7 +143,7 @@ def unmasked(payloads: Sequence[bytes]) -> bytes:
 
 
 class Masker:
-    """Encoder of a client's frames for whole text messages, each masked with a new key."""
+    """Encoder of a client's frames. Each frame contains a whole text message, and is masked with a new key."""
 
     def __init__(self) -> None:
         self._keys: list[bytes] = []
@@ -195,5 +196,5 @@ _MASKED_HEADERS: Final = _Headers(_TEXT, _MASKED)
 
 
 def is_impossible(header: bytes) -> bool:
-    """Return whether a frame has a length of 2**63 or more, which no message has (RFC 6455, 5.2)."""
+    """Return whether a frame's length is 2**63 or more, which RFC 6455 (5.2) forbids."""
     return len(header) > 2 and header[1] & ~_MASKED == _MEDIUM + 1 and header[2] >= 0x80

@@ -29,7 +29,7 @@ from websockets.server import ServerProtocol
 from bridge.transport import frames
 
 MESSAGE_BYTES_HEADER: Final = "Rosbridge-Message-Bytes"
-"""Header of the hub's handshake: maximum size in bytes of the messages that it accepts."""
+"""Header in the hub's handshake with the maximum size in bytes of a message that the hub accepts."""
 # Maximum size of the unread answers to a peer, in messages of the maximum size.
 _MAX_UNREAD: Final = 4
 _BEGINNING: Final = 512
@@ -41,7 +41,7 @@ _DATA_OPCODES: Final = frozenset((Opcode.TEXT, Opcode.BINARY, Opcode.CONT))
 
 
 class WebSocketTransport(asyncio.Protocol):
-    """A WebSocket connection; a subclass handles the handshake, the messages and the end."""
+    """A WebSocket connection. A subclass handles the handshake, the messages and the end of the connection."""
 
     # A turn: after this much from one peer, other tasks get theirs. A client has one peer and needs none. The bytes are
     # those of one read: uvloop would otherwise read from one socket up to 32 times before it looks at the others.
@@ -51,7 +51,7 @@ class WebSocketTransport(asyncio.Protocol):
     slice_bytes: ClassVar[int] = sys.maxsize
 
     def __init__(self, protocol: ClientProtocol | ServerProtocol, *, max_size: int, write_limit: int) -> None:
-        """Prepare the connection; `protocol` has the same `max_size`. `paused` is set when `write_limit` bytes wait."""
+        """Prepare the connection for a `protocol` with the same `max_size`. `write_limit` unsent bytes set `paused`."""
         # Monotonic seconds of the last data from the peer, whatever it was.
         self.last_heard = time.monotonic()
         # True while messages can be sent. It copies the library's state, which takes longer to look up, after each
@@ -127,23 +127,23 @@ class WebSocketTransport(asyncio.Protocol):
 
     @property
     def is_connected(self) -> bool:
-        """True once there has been a socket, even after its end."""
+        """True once the socket was connected, even after the connection has ended."""
         return self._transport is not None
 
     @property
     def is_blocked(self) -> bool:
-        """Return whether to stop reading now, because the peer does not read the answers to its pings."""
+        """True if reading must stop, because the peer does not read the pongs that answer its pings."""
         return self._pongs_unread
 
     @property
     def is_closing(self) -> bool:
-        """True if there is no socket, or it is about to close."""
+        """True if there is no socket, or if the socket is closing."""
         return self._transport is None or self._transport.is_closing()
 
     # Sending
 
     def send(self, messages: Sequence[bytes]) -> None:
-        """Write messages to an open connection: JSON as text, a server's CBOR as binary."""
+        """Write messages to an open connection: JSON in text frames, and a server's CBOR in binary frames."""
         data = self._encode(messages)
         if self._held is not None:
             self._held.append(data)
@@ -151,14 +151,14 @@ class WebSocketTransport(asyncio.Protocol):
             self._transport.write(data)
 
     def count_unread(self, size: int) -> None:
-        """Count bytes of answers to the peer, and end the connection if very many remain unread."""
+        """Count `size` more bytes of answers, and abort the connection if the peer leaves too many bytes unread."""
         self._unread = self._unread + size if self.paused else 0
         if self.never_reads:
             self.abort()
 
     @property
     def never_reads(self) -> bool:
-        """True if the connection was ended because very many answers remained unread."""
+        """True if the connection was aborted because the peer left too many answers unread."""
         return self._unread > _MAX_UNREAD * self._max_size
 
     def ping(self) -> None:
@@ -187,7 +187,7 @@ class WebSocketTransport(asyncio.Protocol):
 
     @contextmanager
     def together(self) -> Iterator[None]:
-        """At the end of the block, write everything sent inside it at once."""
+        """Collect the output of a `with` block, and write it at once when the block ends."""
         if self._held is not None:
             yield
             return
@@ -225,7 +225,7 @@ class WebSocketTransport(asyncio.Protocol):
         self._transport.set_write_buffer_limits(high=self._write_limit)
 
     def data_received(self, data: bytes) -> None:
-        """Handle bytes from the socket: whole messages here, all other frames by the library."""
+        """Handle bytes from the socket. The library handles all frames except whole messages."""
         self.last_heard = time.monotonic()
         at = 0
         if self._rest:
@@ -267,7 +267,7 @@ class WebSocketTransport(asyncio.Protocol):
         self.connection_ended(exc)
 
     def pause_writing(self) -> None:
-        """Make writers wait, because the socket accepts nothing now."""
+        """Make writers wait, because the write buffer is full."""
         self.paused = True
         self._writable.clear()
 
@@ -309,7 +309,7 @@ class WebSocketTransport(asyncio.Protocol):
             self._interrupt(data, end)
 
     def postpone(self, messages: list[bytes]) -> None:
-        """Handle these messages in a later turn, before all later data."""
+        """Keep messages for the next turn, which handles them before all later data."""
         self._postponed = messages
 
     def _interrupt(self, data: bytes, at: int) -> None:

@@ -1,4 +1,4 @@
-"""A board of the mini-cluster as its host drives it: its link, its registers' known contents, its part of a frame."""
+"""The host's view of a board: the link, the known contents of registers, and the board's part of a frame."""
 
 import select
 import struct
@@ -35,10 +35,10 @@ _CAPABILITIES: Final = range(rm.CAP_MACHINE, rm.CAP_LINK + 4, 4)
 
 
 class DrivenBoard:
-    """One board: its link, and the known contents of its registers."""
+    """One board of the mini-cluster, with the link and the register contents that the host knows."""
 
     def __init__(self, index: int, endpoint: Endpoint, image: Image, *, reprogram: bool = False) -> None:
-        """Store the board's number, endpoint and image; `reprogram` is the argument of `MiniCluster.open`."""
+        """Store the board's number, endpoint and image. `MiniCluster.open` describes `reprogram`."""
         self.index = index
         self.endpoint = endpoint
         self.image = image
@@ -85,7 +85,7 @@ class DrivenBoard:
     # ---- opening --------------------------------------------------------------------------------------
 
     def open(self, timeout: float, connect_timeout: float, programming_timeout: float) -> None:
-        """Open the board, or raise a PcieShimError; each step of programming may take `programming_timeout`."""
+        """Open the board, or raise a PcieShimError. `programming_timeout` (seconds) limits each step of programming."""
         self.close("it is being opened")
         self._forget()
         link = self._identified(timeout, connect_timeout)
@@ -173,7 +173,7 @@ class DrivenBoard:
 
     @property
     def open_link(self) -> SocketLink:
-        """The link of an open board; a LinkClosedError if the board is not open."""
+        """The link of an open board. Raises a LinkClosedError if the board is not open."""
         if self.link is None:
             raise LinkClosedError(
                 f"The link to the board at {self.endpoint} is closed ({self.broken}): reopen the board"
@@ -191,12 +191,12 @@ class DrivenBoard:
     # ---- a frame --------------------------------------------------------------------------------------
 
     def start(self, settings: FrameSettings, blocks: Blocks, end: int) -> None:
-        """Post a new frame: the inputs and settings that changed, and the doorbell (figure 3.3)."""
+        """Start a new frame: write the changed blocks and settings, and ring the doorbell (figure 3.3)."""
         self.waiting = True  # from here on, abandoning the frame must interrupt the board
         self._ring(settings, blocks, _START, end)
 
     def resume(self, settings: FrameSettings, blocks: Blocks, end: int) -> None:
-        """Post the frame's next slice: the blocks and settings that changed, and the doorbell."""
+        """Start the frame's next slice: write the changed blocks and settings, and ring the doorbell."""
         self._ring(settings, blocks, _RESUME, end, 0)
 
     def _changed(self, blocks: Blocks) -> list[RegisterWrite]:
@@ -232,10 +232,10 @@ class DrivenBoard:
         link.post(writes)
 
     def receive(self) -> bool:
-        """Receive once, after a poll; return whether the board is done.
+        """Receive from the link once, after a poll. Returns whether the board is done.
 
         Raises:
-            LinkError: The link failed, or the board answered twice, or with a number other than the doorbell's.
+            LinkError: The link failed, or the board sent an answer that is invalid, repeated or for another doorbell.
         """
         link = self.open_link
         done = link.receive_done()
@@ -266,7 +266,7 @@ class DrivenBoard:
         self.done = done
 
     def ask(self) -> None:
-        """Request the answer of a board that is done, if its interrupt did not carry it."""
+        """Request the answer of a board that is done, unless the board's interrupts carry the answers."""
         if not self.sends_results:
             self.asked = True
             self.open_link.ask([*self._answer_blocks, (rm.DONE, DONE_BLOCK.size // 4)])
@@ -311,7 +311,7 @@ class DrivenBoard:
         return self.done
 
     def result(self) -> BoardResult:
-        """Return the result of the frame; the words are copied from the buffer of the link."""
+        """Return the result of the frame, with a copy of the words in the link's buffer."""
         done = self._answered()
         words = bytes(self.answer[: self._results_bytes])
         if self.replicas == 1:
@@ -321,5 +321,5 @@ class DrivenBoard:
 
 
 def board_error(board: DrivenBoard, error: PcieShimError) -> BoardError:
-    """Return the BoardError to raise from an error of a board's link or image."""
+    """Return a BoardError that wraps an error of a board's link or image."""
     return BoardError(f"Board {board.index}: {error}", board=board.index, exit_code=error.exit_code)

@@ -1,4 +1,4 @@
-"""Command lines of the processes that a master starts, with the settings of its run."""
+"""Command lines of the processes that a master starts. Their flags contain the settings of the run."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from terminal.processes import own_command
 from toolchain.deployment import Deployment
 
 METRICS_PORTS = {"subscriber": 1, "publisher": 2, "pcie-app": 3, "board": 4}
-"""Offsets of the processes' metrics ports from the master's port; board N uses the offset of `board` plus N."""
+"""Offset of each process's metrics port from the master's metrics port. Board N adds N to the offset of `board`."""
 
 
 def _metrics(settings: Settings, role: str) -> list[str]:
@@ -39,7 +39,7 @@ def boards_arguments(boards: int, directory: Path, settings: Settings, *, once: 
 def dashboard_command(
     settings: Settings, deployment: Deployment, directory: Path | None, port: int
 ) -> list[str]:
-    """Return the command of the page that shows a run's results; `directory` is the folder of the run's sockets."""
+    """Return the command of a run's dashboard. `directory` is the run directory, which contains the sockets."""
     command = [*own_command("dashboard"), "--deployment", str(deployment.directory)]
     values = {
         "uri": settings.uri,
@@ -66,7 +66,7 @@ _SETTINGS = {
 
 
 def service_arguments(role: str, endpoint: Endpoint, settings: Settings, *, reprogram: bool) -> list[str]:
-    """Return the arguments of the command of a service, which listens at `endpoint`."""
+    """Return the command-line arguments with which a service listens at `endpoint`."""
     arguments = ["--listen", str(endpoint), *_metrics(settings, role)]
     for name in ("deployment", "log_level", *_SETTINGS[role]):
         value = getattr(settings, name)

@@ -43,7 +43,7 @@ class Interval:
 
 
 def bootstrap(values: NDArray[np.float64], statistic: Callable[..., NDArray[np.float64]]) -> Interval:
-    """Return a statistic over frames (the first axis) with a percentile bootstrap interval, which resamples frames."""
+    """Return a statistic with a percentile bootstrap interval. Frames (the first axis of `values`) are resampled."""
     chosen = np.random.default_rng(0).integers(0, len(values), (RESAMPLES, len(values)))
     drawn = np.asarray(values)[chosen].reshape(RESAMPLES, -1)
     low, high = np.quantile(statistic(drawn, axis=1), [(1 - LEVEL) / 2, (1 + LEVEL) / 2]).tolist()
@@ -51,7 +51,7 @@ def bootstrap(values: NDArray[np.float64], statistic: Callable[..., NDArray[np.f
 
 
 def share_of_frames(share: float, frames: int) -> Interval:
-    """Return a share of frames with its Wilson interval, which is valid even if the share is 0 or 1."""
+    """Return a share of frames with a Wilson interval. This interval is valid even if the share is 0 or 1."""
     square = _NORMAL_95**2 / frames
     middle = (share + square / 2) / (1 + square)
     half = _NORMAL_95 / (1 + square) * math.sqrt(share * (1 - share) / frames + square / (4 * frames))
@@ -59,7 +59,7 @@ def share_of_frames(share: float, frames: int) -> Interval:
 
 
 EXPECTED_COUNT: Final = 5.0
-"""Minimum expected count of a line that gets a z-score, because lower counts are not approximately normal."""
+"""A line gets a z-score if its expected count is at least this. Lower counts are not approximately normal."""
 
 _TIE: Final = 1e-9
 _LOST: Final = (1.0, math.nan, 0.0)
@@ -110,7 +110,7 @@ class ZScores:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cycles:
-    """Statistics of a frame's cycles on its longest-running board, over frames and banks of seeds."""
+    """Statistics of the cycles of the board that runs longest in a frame, over frames and banks of seeds."""
 
     median: Interval
     percentile_95: Interval
@@ -118,7 +118,7 @@ class Cycles:
 
     @classmethod
     def of(cls, lengths: NDArray[np.float64]) -> Self:
-        """Return the statistics of the cycles of frames, float64[frames] or [frames, banks]."""
+        """Return the statistics of numbers of cycles, float64[frames] or float64[frames, banks]."""
         return cls(
             median=bootstrap(lengths, np.median),
             percentile_95=bootstrap(lengths, lambda a, **k: np.quantile(a, 0.95, **k)),

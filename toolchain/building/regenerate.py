@@ -1,4 +1,4 @@
-"""Regeneration of one part of a deployment: memories, project, or `deployment.toml` with edits (thesis 3.4)."""
+"""Regeneration of one part of a deployment: the memory files, the project or `deployment.toml` (thesis 3.4)."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -39,7 +39,7 @@ from toolchain.outputs.output_files import (
 
 
 def edited(deployment: Deployment, edits: DeploymentEdits) -> Deployment:
-    """Return the deployment with the edits and a new hash, or raise a BuildError for a wrong edit."""
+    """Return the edited deployment with a new hash, or raise a BuildError if an edit is invalid."""
     target = _defined(uri=edits.uri, topic=edits.topic, type=edits.type)
     if target and len(deployment.sources) > 1:
         raise BuildError(

@@ -167,7 +167,7 @@ _MOST_PAIRS: Final = 20_000_000
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """Bits of a group that XOR to 0 in every cycle. A group is a bank or, with a generator per cell, a line of a bank."""
+    """Bits that XOR to 0 in every cycle. Their group is a bank or, with a generator per cell, a line of a bank."""
 
     group: int
     bits: tuple[Bit, ...]

@@ -1,4 +1,4 @@
-"""Loading of a case study's `model.py`, and the call of its `model()` with the values of `--set`."""
+"""Loader of a case study's `model.py`. It calls the file's function `model` with the values of `--set`."""
 
 import importlib.util
 import inspect
@@ -56,9 +56,9 @@ def load_question(case: Path, settings: Mapping[str, str]) -> Model | Question:
 
 
 def installed_models() -> dict[str, Path]:
-    """Return the models that are installed with rosbayes, such as `boat`, by name.
+    """Return the files of the models that are installed with rosbayes, by name, such as `boat`.
 
-    They are found by the name of their package, because the toolchain imports no case study.
+    The function searches the package `casestudies` without an import, because the toolchain imports no case study.
     """
     package = importlib.util.find_spec("casestudies")
     folders = (package and package.submodule_search_locations) or ()
@@ -66,7 +66,7 @@ def installed_models() -> dict[str, Path]:
 
 
 def model_path(case: Path) -> Path:
-    """Return the path of a model: `model.py` in the given folder, the given file, or the file of an installed model."""
+    """Return the path of a `model.py`: the given file, the file in a given folder, or an installed model's file."""
     case = Path(case)
     if case.name == FILE_NAME and case.is_file():
         return case
@@ -75,7 +75,7 @@ def model_path(case: Path) -> Path:
 
 
 def existing_model_path(case: Path) -> Path:
-    """Return the path of a case study's model, or raise a ModelError if there is none."""
+    """Return the path from `model_path`, or raise a ModelError if no file has this path."""
     path = model_path(case)
     if not path.is_file():
         what = "does not exist"

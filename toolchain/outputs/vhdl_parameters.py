@@ -1,4 +1,4 @@
-"""`bm1_parameters.vhd`: all parameters for the VHDL of the machine, in one package (thesis 3.2)."""
+"""`bm1_parameters.vhd`: the VHDL package with all parameters of a BM1 (thesis 3.2)."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -37,7 +37,7 @@ _TYPES: Final = """\
 
 
 def parameters_vhd(deployment: Deployment, images: Sequence[Image]) -> str:
-    """Return the text of the package: VHDL-2008, printable ASCII, the same bytes for the same machine."""
+    """Return the text of the package, in VHDL-2008 and printable ASCII. Equal machines give equal bytes."""
     image = images[0]
     parameters = image.machine.parameters
     searched = ", ".join(f"{dimension.label} ({dimension.size})" for dimension in deployment.searched)
@@ -226,13 +226,13 @@ _IMAGE_HASH: Final = re.compile(r'(image_hash\s*=>\s*)x"[0-9a-f]{64}"')
 
 @dataclass(frozen=True, slots=True)
 class PackageTokens:
-    """The tokens of the build's VHDL package, in lower case, without comments, each with its line.
+    """The tokens of a VHDL package of parameters, each with its line. Tokens are in lower case, and exclude comments.
 
     Hashes of images are left out, because they follow from the other tokens.
     """
 
     name: str
-    """The file of the package, to be named in errors."""
+    """Path of the package's file, to be named in errors."""
     tokens: tuple[tuple[str, int], ...]
 
     @classmethod
@@ -252,7 +252,7 @@ class PackageTokens:
         return cls.of(read_bounded(path, _MOST_BYTES, BuildError).decode("latin-1"), str(path))
 
     def value(self, constant: str) -> tuple[str, int]:
-        """Return a constant's value, which must be one token, and its line, or raise a BuildError."""
+        """Return the value of a constant (its first token), and the token's line, or raise a BuildError."""
         words = [token for token, _ in self.tokens]
         for at in range(len(words) - 1):
             if words[at : at + 2] == ["constant", constant.lower()] and ":=" in words[at:]:
@@ -262,7 +262,7 @@ class PackageTokens:
         )
 
     def check_same(self, expected: Self) -> None:
-        """Raise a BuildError for the first token that is not the expected one."""
+        """Raise a BuildError for the first token that differs from `expected`."""
         constant, before = "the package", ""
         for found, due in zip_longest(self.tokens, expected.tokens, fillvalue=("the end", None)):
             if found[0] != due[0]:

@@ -1,4 +1,4 @@
-"""Advertised topics of a client; all advertisements of a topic share one `advertise` operation on the wire."""
+"""Advertised topics of a client. All advertisements of a topic share one `advertise` operation to the server."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -47,7 +47,7 @@ class Publications:
         self._advertisements: dict[int, _Advertised] = {}
 
     def restore(self) -> None:
-        """Advertise everything on a new connection, and repeat the last message of latched topics."""
+        """Advertise all topics on a new connection, and repeat the last message of each latched topic."""
         for advertised in self._advertised.values():
             self._send_advertise(advertised)
             # A server that has refused its size would close the connection again.
@@ -122,7 +122,7 @@ class Publications:
             advertised.unchecked = set(advertised.holders)
 
     def publish(self, advertisement: int, msg: Mapping[str, Any]) -> bytes:
-        """Encode a message of an advertised topic, and return it for the caller to send, bypassing the outbox."""
+        """Check and encode a message of an advertised topic. The caller sends the returned bytes without the outbox."""
         advertised = self._advertisements[advertisement]
         prefix = advertised.prefix
         try:
@@ -145,7 +145,7 @@ class Publications:
         return data
 
     def unadvertise(self, advertisement: int) -> None:
-        """End an advertisement; after the last one of a topic, withdraw the topic from the server."""
+        """End an advertisement. If it was the topic's last advertisement, withdraw the topic from the server."""
         advertised = self._advertisements.pop(advertisement)
         advertised.holders.discard(advertisement)
         advertised.unchecked.discard(advertisement)
