@@ -22,24 +22,24 @@ class Grid:
 
     @property
     def cell_width(self) -> float:
-        """A cell's extent along x, in the map's units."""
+        """Size of a cell along x, in the map's units."""
         return (self.x_high - self.x_low) / self.width
 
     @property
     def cell_height(self) -> float:
-        """A cell's extent along y, in the map's units."""
+        """Size of a cell along y, in the map's units."""
         return (self.y_high - self.y_low) / self.height
 
     def cell(self, x: float, y: float) -> tuple[int, int]:
-        """Return the (column, row) of the cell that contains a point, or of the border cell nearest to it."""
+        """Return the (column, row) of the cell that contains a point, or of the nearest cell to a point outside."""
         column = math.floor((x - self.x_low) / self.cell_width)
         row = math.floor((y - self.y_low) / self.cell_height)
         return min(max(column, 0), self.width - 1), min(max(row, 0), self.height - 1)
 
     def mean(self, posterior: Sequence[float]) -> tuple[float, float]:
-        """Return the mean position (x, y) of a posterior over the cells' centres, in the map's units.
+        """Return the mean position (x, y) of a posterior, in the map's units. A cell counts with its centre.
 
-        The posterior is float64[cells], row-major, without negative values; its sum is above 0, but need not be 1.
+        The posterior is float64[cells], row-major. No value is negative. The sum is above 0, but need not be 1.
         """
         total = math.fsum(posterior)
         by_row = [

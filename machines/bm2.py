@@ -1,4 +1,4 @@
-"""The data of a BM2: its parameters, tables, the start of a frame, and its stop reasons (thesis 2.1.3)."""
+"""The data of a BM2: parameters, tables, start states of frames, and stop reasons (thesis 2.1.3)."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -26,13 +26,13 @@ from machines.parameters import (
 )
 
 STATE_BITS_MAX: Final = 2048
-"""Maximum number of bits of the state: the register map has 64 words for a state."""
+"""Maximum number of bits of the state. The register map has 64 words for a state."""
 
 FACTOR_BITS_MAX: Final = 20
-"""Maximum number of bits of a factor's variables together; a factor of 20 bits has 20 * 2**19 codes, or 20 MB."""
+"""Maximum total number of bits of a factor's variables. A factor of 20 bits has 20 * 2**19 codes, or 20 MB."""
 
 RESULT_WORDS_MAX: Final = 4096
-"""Maximum number of words of all histograms, including the joint one: the size of RESULTS in the register map."""
+"""Maximum number of words of all histograms, with the joint histogram. The register map's RESULTS has this size."""
 
 CHAINS_MAX: Final = 65536
 """Maximum number of boards that run chains of one model."""
@@ -41,32 +41,32 @@ SAMPLES_MAX: Final = 2**32 - 1
 """Maximum number of samples of a frame, so that no 32-bit count in a histogram overflows."""
 
 CDES_MAX: Final = 8192
-"""Maximum number of factors, each of which has a CDE."""
+"""Maximum number of factors. Each factor has a conditional distribution encoder (CDE)."""
 
 FACTOR_VARIABLES_MAX: Final = 32
-"""Maximum number of variables of a factor: its array has an axis for each."""
+"""Maximum number of variables of a factor. The array of the factor has one axis for each variable."""
 
 SEARCH_MAX: Final = 150_000
 """Maximum work of the search for a start state, in arbitrary units. This work takes about a second."""
 
 
 class BM2StopReason(IntEnum):
-    """The reason why a BM2 stopped. The numbers are those of the status register."""
+    """The reason why a BM2 stopped, with the numbers that the status register has for the reasons."""
 
     NONE = 0
     """The machine has not run since the reset."""
     SAMPLES = 1
-    """All samples are drawn; a resume draws more."""
+    """All samples are drawn. A resumed run draws more samples."""
     MAX_CYCLES = 2
-    """The frame's last cycle was run before all samples were drawn."""
+    """The machine reached the frame's maximum number of cycles before it had drawn all samples."""
     PAUSED = 3
-    """The cycle `pause_at` was run; `step` continues."""
+    """The machine paused after the cycle `pause_at`. `step` continues the run."""
     IMPOSSIBLE = 4
-    """The start had 0 samples (no state agrees with the evidence), so the machine did not run."""
+    """The machine did not run, because the frame asked for 0 samples: no state agrees with the evidence."""
     OPS_TIMEOUT = 5
-    """The CDEs whose factor has a bit did not agree on the bit within the `ops_timeout` cycles of a move."""
+    """In a move, the CDEs of a bit's factors did not agree on the bit within `ops_timeout` cycles."""
     FULL = 6
-    """The stream's buffer is full; a resume empties it and continues."""
+    """The buffer of the stream of samples is full. A resumed run empties the buffer and continues."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -211,7 +211,7 @@ class BM2Parameters:
 
     @property
     def masks(self) -> tuple[int, ...]:
-        """The state bits of each variable, as a mask."""
+        """For each variable, the mask of its bits in the state."""
         return tuple(
             ((1 << bits) - 1) << offset for bits, offset in zip(self.bits, self.offsets, strict=True)
         )
@@ -223,7 +223,7 @@ class BM2Parameters:
 
     @property
     def histogram_words(self) -> int:
-        """Number of words of the variables' histograms: one for each code of a variable, including unused codes."""
+        """Number of words of the variables' histograms. Each code of a variable has a word, even an unused code."""
         return sum(1 << bits for bits in self.bits)
 
     @property
@@ -237,12 +237,12 @@ class BM2Parameters:
 
     @property
     def result_words(self) -> int:
-        """Number of words of all histograms, including the histogram of the joint."""
+        """Number of words of all histograms, including the joint histogram."""
         return self.histogram_words + self.joint_words
 
     @property
     def ones_code(self) -> int:
-        """The largest probability code, and the mask of a generator's output."""
+        """The largest probability code. It is also the mask of a generator's output."""
         return (1 << self.prob_bits) - 1
 
     @property
@@ -251,7 +251,7 @@ class BM2Parameters:
         return (self.cdes,)
 
     def factor_bits(self, factor: int) -> tuple[int, ...]:
-        """Return the state bits of a factor's variables, in rising order: its local bits."""
+        """Return the local bits of a factor: the state bits of its variables, in rising order."""
         bits, offsets = _layout(self.cardinalities)
         return tuple(
             offsets[variable] + bit for variable in self.factors[factor] for bit in range(bits[variable])
@@ -259,9 +259,9 @@ class BM2Parameters:
 
     @property
     def colours(self) -> tuple[int, ...]:
-        """The colour of each variable, a number from 0; no factor has two variables of one colour.
+        """The colour of each variable, as a number from 0. A factor never has two variables of one colour.
 
-        Variables with more neighbours are coloured first, and each gets the smallest colour that no neighbour has.
+        Variables with more neighbours are coloured first. A variable gets the smallest colour that no neighbour has.
         """
         neighbours: list[set[int]] = [set() for _ in self.cardinalities]
         for factor in self.factors:
@@ -274,9 +274,9 @@ class BM2Parameters:
         return tuple(colours[variable] for variable in range(len(neighbours)))
 
     def moves(self, known: int, sequencer: Sequencer) -> tuple[tuple[int, ...], ...]:
-        """Return the bits of each move of a sweep, in rising order, without the bits in the mask `known`.
+        """Return the state bits that each move of a sweep draws, in rising order, without the bits in the mask `known`.
 
-        For `random`, these are the moves from which the sequencer draws.
+        The sequencer `random` draws its moves from this list.
         """
         if sequencer is not Sequencer.COLOURED:
             return tuple((bit,) for bit in range(self.state_bits) if not known >> bit & 1)
@@ -420,12 +420,12 @@ def cde_table(factor: npt.NDArray[np.float64], prob_bits: int) -> npt.NDArray[np
 
 
 def pack(parameters: BM2Parameters, values: Sequence[int]) -> int:
-    """Return the packed state of the values, one per variable."""
+    """Pack values, one for each variable, into a state."""
     return sum(value << offset for value, offset in zip(values, parameters.offsets, strict=True))
 
 
 def unpack(parameters: BM2Parameters, state: int) -> tuple[int, ...]:
-    """Return the code of every variable in a packed state, even if a code is not below the variable's cardinality."""
+    """Return the code of every variable in a packed state. Codes are not checked against cardinalities."""
     return tuple(
         state >> offset & (1 << bits) - 1
         for offset, bits in zip(parameters.offsets, parameters.bits, strict=True)
@@ -433,7 +433,7 @@ def unpack(parameters: BM2Parameters, state: int) -> tuple[int, ...]:
 
 
 def unpack_all(cardinalities: tuple[int, ...], states: npt.NDArray[np.uint32]) -> npt.NDArray[np.int64]:
-    """Return the code of every variable in packed states, uint32[states, words], as int64[states, variables]."""
+    """Unpack states, uint32[states, words], into the codes of their variables, int64[states, variables]."""
     bits = np.unpackbits(states.astype("<u4").view(np.uint8), axis=1, bitorder="little")
     layout = zip(*_layout(cardinalities), strict=True)
     return np.stack([bits[:, at : at + width] @ (1 << np.arange(width)) for width, at in layout], axis=1)
@@ -443,10 +443,10 @@ def unpack_all(cardinalities: tuple[int, ...], states: npt.NDArray[np.uint32]) -
 
 
 def start_state(machine: BM2Machine, evidence: Mapping[int, int], *, largest: bool = False) -> int | None:
-    """Return the lexicographically smallest (or largest) state of non-zero probability; variable 0 comes first.
+    """Return the lexicographically smallest state of non-zero probability that agrees with the evidence, or None.
 
-    The state agrees with the evidence, the values of the known variables; if no state does, the result is None.
-    `largest` is for every second board: chains that start far apart show whether they mix.
+    Variable 0 comes first in the order. The evidence is the values of the known variables. With `largest`, the largest
+    state is returned. Every second board starts from it, because chains that start far apart show whether they mix.
 
     Raises:
         StartError: A value is out of range, or the work of the search exceeds `SEARCH_MAX`.

@@ -1,8 +1,8 @@
-"""Frames of the link, without sockets: encoding and decoding (docs/reference/boards.md has the wire format).
+"""Encoding and decoding of frames of the link, without sockets. docs/reference/boards.md has the wire format.
 
-All numbers are little-endian. The CRC covers the other 16 bytes of the header and the words. Read requests and
-replies to writes have a count, but no words. The framing corresponds to the data link layer of thesis 2.3, which adds
-sequence numbers and CRCs to read and write requests.
+All numbers are little-endian. The CRC covers the payload and the other 16 bytes of the header. Read requests and
+replies to writes have a count of words, but no payload. The framing corresponds to the data link layer of thesis 2.3:
+it adds sequence numbers and CRCs to read and write requests.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Octets: TypeAlias = bytes | bytearray | memoryview
 
 # Plain integers, because members of an enumeration cost a look-up and a conversion in every frame.
 GREET: Final = 1
-"""Board to host, the first frame of a link: the `Greeting`."""
+"""Board to host: the `Greeting`, when a link opens."""
 READ: Final = 2
 """Host to board: read `count` words, starting at `address`. The reply contains the words."""
 WRITE: Final = 3
@@ -25,27 +25,27 @@ WRITE: Final = 3
 IRQ: Final = 4
 """Board to host: the machine has stopped.
 
-The payload is the registers from DONE to COMPUTE_NS, then the results if CAP_LINK.SENDS_RESULTS is 1.
+The payload contains the registers from DONE to COMPUTE_NS. If `CAP_LINK.SENDS_RESULTS` is 1, the results follow.
 """
 ERROR: Final = 5
-"""Board to host: the request of this sequence number was refused (`encode_error`)."""
+"""Board to host: the board refused the request that has this sequence number (`encode_error`)."""
 PROGRAM: Final = 6
 """Loader to the programming port: a part of a programming file. `address` is the part's offset in bytes."""
 AUTHENTICATE: Final = 7
-"""Board to host before GREET: a challenge. The host answers with nonce and proof, the board with its own proof."""
+"""Before GREET, the board sends a challenge. The host answers with a nonce and a proof. The board sends its proof."""
 
 REPLY: Final = 1
-"""Flag: the answer to the request of the same sequence number."""
+"""Flag: the frame answers the request that has the same sequence number."""
 POSTED: Final = 2
 """Flag: the request gets no acknowledgement. A refused request still gets an ERROR."""
 BEGIN: Final = 4
-"""Flag of PROGRAM: the payload announces the file (`ProgramBegin`)."""
+"""Flag of PROGRAM: the payload is a `ProgramBegin`, which announces the file."""
 END: Final = 8
 """Flag of PROGRAM: the file is complete. The board replies after it has loaded the file."""
 
 PROTOCOL_VERSION: Final = 1
 MAX_PAYLOAD_WORDS: Final = 8448
-"""Maximum payload in words. INPUTS, the longest block, fits into it, and so do RESULTS and STREAM together."""
+"""Maximum payload in words. It is enough for INPUTS, the longest block, and for RESULTS and STREAM together."""
 
 _MAGIC: Final = 0x4D42
 _HEAD: Final = struct.Struct("<HBBIII")
@@ -80,16 +80,16 @@ class Frame(NamedTuple):
 def encode(
     operation: int, flags: int, sequence: int, address: int, count: int, payload: Octets = b""
 ) -> bytes:
-    """Return the bytes of a frame; `payload` has `count` words, or is empty."""
+    """Return the bytes of a frame. `payload` has `count` words, or is empty."""
     head = _HEAD.pack(_MAGIC, operation, flags, sequence, address, count)
     return b"".join((head, _CRC.pack(crc32(payload, crc32(head))), payload))
 
 
 class FrameDecoder:
-    """Decoder of a stream of bytes into frames, which receives into the same buffer as long as the link is open.
+    """Decoder of a stream of bytes into frames, with one buffer as long as the link is open.
 
-    Receive into `room`, pass the number of bytes to `received`, then call `next_frame` until it returns None.
-    After an error the decoder is unusable.
+    Receive bytes into `room`, and pass their number to `received`. Then call `next_frame` until it returns None.
+    After an error, the decoder is unusable.
     """
 
     def __init__(self) -> None:
@@ -105,7 +105,7 @@ class FrameDecoder:
         return self._end > self._start
 
     def room(self) -> memoryview:
-        """Return the buffer for the next bytes; payloads returned so far become invalid."""
+        """Return the buffer for the next bytes. Payloads that were returned before become invalid."""
         if self._start == self._end:
             # the usual case: all frames were taken, and nothing has to be moved
             self._start = self._end = 0
@@ -189,7 +189,7 @@ def decode_greeting(frame: Frame) -> Greeting:
 
 
 def encode_error(sequence: int, address: int, code: int, detail: str) -> bytes:
-    """Return an ERROR frame: a word with the code, then the board's sentence in UTF-8, padded with zeros."""
+    """Return an ERROR frame. Its payload is a word with the code, and then a sentence in UTF-8, padded with zeros."""
     words = detail.encode()[:1024]
     payload = _CRC.pack(code) + words + bytes(-len(words) % 4)
     return encode(ERROR, REPLY, sequence, address, len(payload) // 4, payload)
@@ -209,19 +209,19 @@ NO_TOKEN: Final = bytes(8)
 
 
 class ProgramBegin(NamedTuple):
-    """A loader's announcement of a file of `size` bytes, with the token of its host's board link or `NO_TOKEN`."""
+    """A loader's announcement of a file of `size` bytes. `token` is that of the host's board link or `NO_TOKEN`."""
 
     size: int
     sha256: bytes
     token: bytes
 
     def encode(self) -> bytes:
-        """Return the payload of a PROGRAM frame with BEGIN."""
+        """Return the payload of a PROGRAM frame with the flag BEGIN."""
         return _PROGRAM_BEGIN.pack(*self)
 
     @classmethod
     def decode(cls, payload: memoryview) -> ProgramBegin:
-        """Decode a frame's payload; a FramingError if it is too short."""
+        """Decode a frame's payload, or raise a FramingError if the payload is too short."""
         if len(payload) < _PROGRAM_BEGIN.size:
             raise FramingError("a PROGRAM frame with BEGIN is too short")
         return cls(*_PROGRAM_BEGIN.unpack_from(payload))

@@ -21,7 +21,7 @@ class LinkFigures:
     shared: bool
 
     def seconds(self, size: int, transfers: int = 1) -> float:
-        """Return the time in seconds of `size` bytes in this many transfers, one after another."""
+        """Return the seconds that `size` bytes take in `transfers` transfers, one after another."""
         return 8e-6 * size / self.mbps + 1e-6 * transfers * self.latency_us
 
 

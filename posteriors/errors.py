@@ -1,4 +1,4 @@
-"""Errors of received posteriors, which are `BridgeError`s with an exit code, like all errors of a connection."""
+"""Errors of received posteriors. They are `BridgeError`s with an exit code, like all errors of a connection."""
 
 from bridge.errors import BridgeError, NoMessageError
 
@@ -16,7 +16,7 @@ class NoResultError(PosteriorError, NoMessageError):
 
 
 class BadResultError(PosteriorError):
-    """Raised when a message on a result topic cannot come from a master."""
+    """Raised when a message on a result topic does not have the form of a master's messages."""
 
 
 class LabelError(PosteriorError):

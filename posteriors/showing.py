@@ -1,6 +1,7 @@
-"""A posterior as a notebook shows it: a table with bars or a map as HTML, and the same drawn with matplotlib.
+"""Views of a posterior for notebooks: bars or a map, as HTML or drawn with matplotlib.
 
-Labels, states and details come from files and networks: they are shortened, escaped, and never read as mathematics.
+Labels, states and details come from files and networks. They are shortened and escaped, and matplotlib shows them as
+plain text, not as formulas.
 """
 
 import base64
@@ -45,7 +46,7 @@ def _plane(axes: Sequence[Axis], values: NDArray[Any]) -> tuple[list[Axis], NDAr
 
 
 def as_html(axes: Sequence[Axis], values: NDArray[np.float64], facts: Iterable[str]) -> str:
-    """Return HTML with a table of the axes, a line of facts and a picture; viewers would remove scripts and styles."""
+    """Return HTML with a table of the axes, facts and a picture. Viewers remove scripts and styles, so it has none."""
     best = np.unravel_index(values.argmax(), values.shape)
     rows = [
         (
@@ -113,7 +114,7 @@ def _image(shades: NDArray[Any]) -> str:
 
 
 def draw(all_axes: Sequence[Axis], all_values: NDArray[np.float64], into: Any) -> Any:
-    """Draw bars or a map in matplotlib's Axes, by default those of a new figure, and return the Axes."""
+    """Draw bars or a map into matplotlib Axes, and return the Axes. If `into` is None, the figure is new."""
     if into is None:
         from matplotlib import pyplot as plt
 

@@ -1,4 +1,4 @@
-"""Processes that a command or a script starts, follows and ends: those of the demo, for example."""
+"""Processes that a command or a script starts, watches and ends, such as the processes of the demo."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from terminal.logs import name_process
 from terminal.signals import ENDING_SIGNALS
 
 SILENCE: Final = 1.5
-"""Seconds without a line after which a `Screen` shows that the work continues."""
+"""If a `Screen` prints no line for this many seconds, it shows that the work continues."""
 _PR_SET_PDEATHSIG: Final = 1
 _PR_SET_NAME: Final = 15
 
@@ -42,12 +42,12 @@ def own_command(name: str) -> list[str]:
 
 
 def ask_for_end_with_parent() -> None:
-    """Make the kernel send SIGTERM to this process when its parent exits, also after an exec."""
+    """Make the kernel send SIGTERM to this process when its parent exits. An exec does not change this."""
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
 
 
 class Forked:
-    """A forked or spawned child process, with the part of the interface of asyncio's `Process` that is used here."""
+    """A forked or spawned child process, with some of the methods of asyncio's `Process`."""
 
     def __init__(self, pid: int) -> None:
         self.pid = pid
@@ -78,7 +78,7 @@ class Forked:
 
 
 def fork(run: Callable[[], NoReturn]) -> Forked:
-    """Run a function in a forked process. At its start `ENDING_SIGNALS` are blocked; it must not return, but exit."""
+    """Call `run` in a forked process. At first, `ENDING_SIGNALS` are blocked. `run` must exit instead of returning."""
     # until the child has handlers of its own, a signal would reach the event loop of this process instead
     signal.pthread_sigmask(signal.SIG_BLOCK, ENDING_SIGNALS)
     pid = os.fork()
@@ -177,7 +177,7 @@ class Process:
         self._news = asyncio.Event()
 
     async def start(self, *command: str) -> None:
-        """Start the process in its own session, so that Ctrl-C reaches only the process that starts it."""
+        """Start the process in its own session. Ctrl-C then reaches only the calling process."""
         if self._forks:
             reading, writing = os.pipe()
             self._process = fork_command(command[0], command[1:], output=writing, errors=writing)
@@ -236,7 +236,7 @@ class Process:
             await self._news.wait()
 
     def failure(self, code: int) -> ProcessError:
-        """Return the end of the process as an error, with the last line that the process printed."""
+        """Return an error for the exit code of the process, with the last line that the process printed."""
         said = self._lines[-1].removeprefix("error: ") if self._lines else "it said nothing"
         error = ProcessError(f"{self.name}: {said} (all that it said is in {self._log})")
         error.exit_code = code if code > 0 else ExitCode.CHILD
@@ -259,7 +259,7 @@ class Process:
             raise self.failure(code)
 
     async def end(self) -> None:
-        """End the process by SIGTERM, and by SIGKILL after 6 s."""
+        """Send SIGTERM to the process. If it still runs after 6 s, send SIGKILL."""
         if self._process is None:
             return
         self._show = None  # that it was terminated is no news
@@ -276,10 +276,10 @@ class Process:
 
 
 class Screen:
-    """The output of a script: its lines, and between them the work that it is waiting for.
+    """The output of a script: its lines and, if no line is due, the work that the script waits for.
 
-    On a terminal, this work is shown in a line with the time so far, which the next line replaces. Elsewhere it is a
-    line followed by dots.
+    On a terminal, a line shows the work and the time so far. The next line replaces it. Elsewhere, a line names the
+    work, and dots follow.
     """
 
     def __init__(self) -> None:
@@ -305,7 +305,7 @@ class Screen:
             self._print("\r\033[K" if sys.stdout.isatty() else "\n")
 
     async def say_what_it_waits_for(self) -> None:
-        """Show the name of the work in progress after each `SILENCE` seconds without a line, until cancelled."""
+        """Until cancelled, show the work in progress after every `SILENCE` seconds without a line."""
         try:
             while True:
                 await asyncio.sleep(max(self._newest + SILENCE - time.monotonic(), 0))

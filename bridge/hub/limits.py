@@ -1,7 +1,7 @@
 """Limits of the hub, its errors, and the validation of the fields of an operation.
 
-Functions that read a field raise a `RefusedOperationError` if it is invalid. The broker logs this error, and answers
-with it if the operation is a call or a goal.
+If a field is invalid, the function that reads the field raises a `RefusedOperationError`. The broker logs the error.
+If the operation is a call or a goal, the broker also sends the error as the answer.
 """
 
 import re
@@ -35,13 +35,13 @@ _ANY_POLICY: Final = ("system_default", "best_available")
 
 
 class HubError(BridgeError):
-    """Raised when the hub cannot serve: its address, its limits or its access control are unusable."""
+    """Raised when the hub cannot serve, because its address, limits or access control are unusable."""
 
     exit_code = 2
 
 
 class RefusedOperationError(BridgeError):
-    """Raised when the hub refuses an operation; the text is for the log, or for the answer to a call."""
+    """Raised when the hub refuses an operation. The text is logged, and answers a call or a goal."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,14 +120,14 @@ class HubLimits:
 
 
 def checked_name(name: str) -> str:
-    """Return the name of a topic, a service or an action, if it is valid."""
+    """Return a valid name of a topic, service or action unchanged, or raise a RefusedOperationError."""
     if len(name) > MAX_NAME or _NAME.fullmatch(name) is None:
         raise RefusedOperationError(f"{name[:80]!r} cannot be a name: expected letters, digits, _ and /")
     return name
 
 
 def text(operation: Operation, field: str) -> str:
-    """Return a required string, which must not be empty."""
+    """Return the string in a required field of an operation. The string must not be empty."""
     value = operation.get(field)
     if not isinstance(value, str) or not value:
         raise RefusedOperationError(f"{field} of {operation['op']} must be a string")
@@ -135,12 +135,12 @@ def text(operation: Operation, field: str) -> str:
 
 
 def optional_text(operation: Operation, field: str) -> str | None:
-    """Return a string that must not be empty, or None if it is left out."""
+    """Return the string in a field, or None if the operation lacks the field. The string must not be empty."""
     return None if operation.get(field) is None else text(operation, field)
 
 
 def flag(operation: Operation, field: str) -> bool:
-    """Return a boolean field of an operation; False if the operation lacks it."""
+    """Return the boolean in a field, or False if the operation lacks the field."""
     value = operation.get(field)
     if value is not None and not isinstance(value, bool):
         raise RefusedOperationError(f"{field} of {operation['op']} must be true or false")
@@ -148,10 +148,10 @@ def flag(operation: Operation, field: str) -> bool:
 
 
 def number(operation: Operation, field: str) -> float:
-    """Return a number that is not negative; 0 if it is left out.
+    """Return the number in a field, or 0 if the operation lacks the field. The number must not be negative.
 
-    The reference server accepts only integers: it ignores an operation that contains `0.0`. The hub accepts `0.0` too,
-    because no client wants its operations ignored.
+    The reference server accepts only integers, and ignores an operation that contains `0.0`. The hub accepts `0.0`
+    too, because no client wants its operations ignored.
     """
     value = operation.get(field)
     if value is None:
@@ -162,7 +162,7 @@ def number(operation: Operation, field: str) -> float:
 
 
 def operation_id(operation: Operation) -> OperationId:
-    """Return the operation's id, or None if it is left out."""
+    """Return the operation's id, or None if the operation has no id."""
     value = operation.get("id")
     if isinstance(value, bool) or not isinstance(value, str | int | None):
         raise RefusedOperationError(f"id of {operation['op']} must be a string or an integer")
@@ -172,7 +172,7 @@ def operation_id(operation: Operation) -> OperationId:
 
 
 def quality(operation: Operation) -> Operation:
-    """Return the requested quality of service (`qos`), empty if it is left out."""
+    """Return an operation's quality of service (`qos`), or an empty dictionary if the operation has none."""
     value = operation.get("qos")
     if value is None:
         return {}
@@ -189,5 +189,5 @@ def quality(operation: Operation) -> Operation:
 
 
 def is_logged(count: int) -> bool:
-    """Return whether to log occurrence number `count` of an event: only the 1st, 10th, 100th and so on are logged."""
+    """Return whether to log occurrence number `count` of an event. Only the 1st, 10th, 100th and so on are logged."""
     return str(count).strip("0") == "1"

@@ -73,7 +73,7 @@ def tiles_of(codes: NDArray[np.uint8], pixels: int) -> NDArray[np.uint8]:
 
 
 class Stack:
-    """The running stack (master and boards), to which the matcher sends tiles of likelihoods for posteriors."""
+    """The running stack of master and boards. It computes posteriors of tiles of likelihoods for the matcher."""
 
     def __init__(
         self, tiles: LossyPublication, heard: Posteriors, ros: Ros, *, first_limit_s: float, limit_s: float
@@ -166,7 +166,7 @@ class Matcher:
             warn(sentence)
 
     def take_image(self, side: int, message: Message) -> None:
-        """Take an image of the left (0) or right (1) camera; an unusable one is reported once."""
+        """Take an image of the left (`side` 0) or right (1) camera. The first unusable image of a topic is reported."""
         try:
             pair = self._images.add(side, message.msg)
         except BadImageError as error:
@@ -177,14 +177,17 @@ class Matcher:
             self._news.set()
 
     def take_truth(self, message: Message) -> None:
-        """Take an image of true disparities; an unusable one is reported once."""
+        """Take an image of true disparities. Only the first unusable image is reported."""
         try:
             self._truths.append((header_stamp_ns(message.msg), read_image(message.msg, "32FC1")))
         except BadImageError as error:
             self._warn_once(f"an image on {message.topic} is skipped: {error}", message.topic)
 
     async def next_pair(self, limit_s: float) -> StereoImages:
-        """Return the newest pair that was not returned before, or wait for one; raise a NoResultError if none comes."""
+        """Return the newest pair that was not returned before. If there is none, wait for the next pair.
+
+        Raises a NoResultError if no pair comes within `limit_s` seconds.
+        """
         end = time.monotonic() + limit_s
         while self._newest is None:
             self._news.clear()
@@ -236,9 +239,9 @@ class Matcher:
         first_limit_s: float,
         limit_s: float,
     ) -> None:
-        """Match pairs until `count` are done, or until cancelled, and print a line for each.
+        """Match `count` pairs, or pairs until cancelled if `count` is None, and print a line for each pair.
 
-        `as_message` is `disparity_message` with its arguments about the cameras already filled in.
+        `as_message` is the function `disparity_message`, with the arguments about the cameras filled in.
 
         Raises:
             NoResultError: No pair of images, or no posterior, came in time.
@@ -278,7 +281,7 @@ class Matcher:
                     task.cancel()
 
     def finish(self, out: Path | None) -> None:
-        """Print the times of the newest pair next to the time in the thesis, and draw the pair."""
+        """Print the newest pair's times beside the time in the thesis, and draw the pair into the folder `out`."""
         if self.matched is None:
             return
         print(self.matched.summary())
@@ -331,8 +334,8 @@ def disparity_matcher(
 ) -> None:
     """Turn stereo pairs into disparity images with a stack whose boards hold a machine for each pixel of a tile.
 
-    Left and right images are paired by their stamps. A line for each pair compares the machines with float64 fusion,
-    and both with the true disparities, if they are published.
+    Left and right images are paired by their stamps. A line for each pair compares the machines with float64 fusion.
+    If true disparities are published, the line also compares the machines and the fusion with the true disparities.
     """
     matcher = Matcher(disparities=disparities, pixels=pixels, clock=clock)
     if out is not None:

@@ -1,4 +1,4 @@
-"""Processes of emulated boards: a single one, or a mini-cluster forked from a process with the compiled code."""
+"""Processes of emulated boards: a single board, or a mini-cluster forked from a process with compiled code."""
 
 import asyncio
 import os
@@ -36,7 +36,7 @@ _LISTENS: Final = 128
 
 
 def blank_board(index: int, settings: Settings, hardware: SimulatedHardware | None) -> Board:
-    """Return an emulated board, or a board of `hardware` if that is given."""
+    """Return a blank board. If `hardware` is None, the board is emulated; otherwise its hardware is simulated."""
     return (
         EmulatedBoard(sends_results=not settings.read_results) if hardware is None else hardware.board(index)
     )
@@ -113,7 +113,7 @@ def _await_free(endpoint: Endpoint, limit: float) -> None:
 
 
 class BoardProcesses:
-    """Boards 0 to n-1, each in a child forked from this process, so that all of them share its loaded kernels."""
+    """Boards from 0 to `count` - 1, each in a fork of this process. The forks share the kernels that it has loaded."""
 
     def __init__(
         self,
@@ -123,7 +123,7 @@ class BoardProcesses:
         settings: Settings,
         hardware: SimulatedHardware | None = None,
     ) -> None:
-        """Store the folder of the sockets, and how many `restarts` may happen within the setting `restart_window`."""
+        """Prepare boards with sockets in `directory`. `restarts` limits restarts in the time `restart_window`."""
         self._endpoints = [endpoint_in(directory, f"board{at}") for at in range(count)]
         self._settings = settings
         self._hardware = hardware
@@ -153,7 +153,7 @@ class BoardProcesses:
         self._announced = False
 
     def run(self) -> NoReturn:
-        """Keep the boards running until a signal ends this process, or boards exit too often (BoardFailedError)."""
+        """Keep the boards running until a signal ends this process. If they exit too often, raise a BoardFailedError."""
         from machines import warm_up
 
         # children share these pages, because four imports of numba would take 1.6 s

@@ -35,13 +35,13 @@ _SENTENCES = 3
 
 
 def plain(text: str) -> str:
-    """Return a text without control characters, shortened to `_SHOWN` characters."""
+    """Return a text with `?` for control characters, shortened to `_SHOWN` characters."""
     kept = "".join(each if each.isprintable() else "?" for each in text[:_SHOWN])
     return kept if len(text) <= _SHOWN else f"{kept}..."
 
 
 def screen(stack: StackStatus) -> RenderableType:
-    """Return one screen with the status of a stack."""
+    """Return a screen that shows the status of a stack."""
     # a table appears only if it has rows: a hub alone needs two lines
     parts: list[RenderableType] = [*_verdict(stack), _processes(stack)]
     if any(process.connections for process in stack.processes):
