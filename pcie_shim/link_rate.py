@@ -21,7 +21,7 @@ _SPIN_NS: Final = 150_000
 
 
 def wait_until(tick_ns: int) -> None:
-    """Wait until this time of the monotonic clock, to a few microseconds; sleep for most of a long wait."""
+    """Wait until a time of the monotonic clock, accurate to a few microseconds. Sleep during most of a long wait."""
     while (left := tick_ns - time.monotonic_ns()) > 0:
         if left > _SPIN_NS:
             time.sleep((left - _SPIN_NS) / 1e9)
@@ -43,7 +43,7 @@ class LinkModel:
         self._lock = os.memfd_create("wire") if wire.shared else None
 
     def carry(self, size: int, sent_ns: int) -> None:
-        """Wait until `size` bytes that are sent at this monotonic time would have arrived."""
+        """Wait until a transfer of `size` bytes would have arrived. `sent_ns` is the monotonic time of sending."""
         if self._lock is not None:
             fcntl.lockf(self._lock, fcntl.LOCK_EX)
         leaves_ns = max(sent_ns, self._free_ns[0]) + round(8e3 * size / self._wire.mbps)
@@ -55,5 +55,5 @@ class LinkModel:
 
 
 def link_model(rate: LinkRate) -> LinkModel | None:
-    """Return a model of a link with this rate; None for no delay."""
+    """Return a model of a link with the given rate, or None if the rate is `NONE`."""
     return None if rate is LinkRate.NONE else LinkModel(WIRES[rate])

@@ -24,7 +24,7 @@ _DEPLOYMENTS = "the deployment's"
 
 
 class Settings(BaseModel):
-    """Settings of a user. None or "" stands for the value of the deployment, or for the default behaviour."""
+    """Settings of a user. If a setting is None or "", the deployment's value or the default behaviour applies."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, validate_default=True)
 
@@ -224,7 +224,7 @@ def _expected(name: str, message: str) -> str:
 
 
 def metrics_endpoint(text: str) -> Endpoint:
-    """Parse an address `[HOST:]PORT`, on loopback if it has no host, or raise a SettingsError."""
+    """Parse an address `[HOST:]PORT`, or raise a SettingsError. An address without a host is on loopback."""
     try:
         return parse_endpoint(f"tcp://{text}" if ":" in text else f"tcp://127.0.0.1:{text}")
     except PcieShimError:
@@ -234,5 +234,5 @@ def metrics_endpoint(text: str) -> Endpoint:
 
 
 def endpoint_in(directory: Path, name: str) -> Endpoint:
-    """Return the endpoint of a named local socket in a directory, or raise an EndpointError for a long path."""
+    """Return the endpoint of a named local socket in a directory, or raise an EndpointError if its path is too long."""
     return parse_endpoint(f"unix:{directory.absolute() / name}.sock")

@@ -1,1 +1,1 @@
-"""The embedded rosbridge server: a broker between its clients, for the demo, for tests and for users without ROS."""
+"""The embedded rosbridge server. It passes messages between its clients, for the demo, tests and users without ROS."""

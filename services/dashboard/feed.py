@@ -1,8 +1,8 @@
-"""The state behind the page: the last frames, the times of their stages, rate and losses.
+"""The state that the dashboard's page shows: the last frames, the times of their stages, rate and losses.
 
     frame outcomes ──▶ Feed ──▶ frames (the last 1000), stage times (means per second), rate, losses by reason
 
-It has no clock and no connection: the time of each frame comes with it.
+The feed has no clock and no connection. The caller gives the time of each frame.
 """
 
 import math
@@ -23,21 +23,21 @@ if TYPE_CHECKING:
 
 KEPT_FRAMES: Final = 1000
 KEPT_BYTES: Final = 128 << 20
-"""Maximum size in bytes of all kept posteriors together; if the grid is fine, fewer than `KEPT_FRAMES` are kept."""
+"""Maximum size of all kept posteriors together, in bytes. If the grid is fine, fewer than `KEPT_FRAMES` are kept."""
 STAGE_SECONDS: Final = 300
 RATE_SECONDS: Final = 5
 STAGES: Final = tuple(each.name for each in fields(StageTimes) if each.name != "boards_compute")
-"""The stages that follow each other; `boards_compute` is a part of `compute`."""
+"""The consecutive stages of a frame. `boards_compute` is left out because it is a part of `compute`."""
 OTHER: Final = "other reasons"
 _MAX_REASONS: Final = 20
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class KeptFrame:
-    """A frame in the feed, compared by identity; `values` is None if the frame has no posterior."""
+    """A frame in the feed. If the frame has no posterior, `values` is None. Frames are compared by identity."""
 
     at: int
-    """Place in the sequence of all frames that arrived, from 1."""
+    """Number of the frame in the order of arrival, counted from 1."""
     heard_ns: int
     values: "NDArray[np.float32] | None" = None
     labels: tuple[str, ...] = ()
@@ -54,11 +54,11 @@ class KeptFrame:
 
     @property
     def form(self) -> object:
-        """Labels and sizes, which are equal for posteriors of the same variables."""
+        """Labels and shape of the posterior, or False without one. Posteriors of the same variables have equal forms."""
         return self.values is not None and (self.labels, self.values.shape)
 
     def sampling_error(self, probabilities: "NDArray[np.float64]") -> "NDArray[np.float64] | None":
-        """Return the standard error of each probability; None if the frame has no statistics of samples (a BM1)."""
+        """Return the standard error of each probability, or None if the frame has no statistics of samples (a BM1)."""
         effective = self._statistic("effective_samples")
         error = standard_error(probabilities, effective if 1 <= effective < math.inf else math.nan)
         # boards that disagree do not know each value's error, so the error of the worst value is used
@@ -122,17 +122,17 @@ class Feed:
 
     @property
     def newest(self) -> KeptFrame | None:
-        """The newest frame; None before the first one."""
+        """The newest frame, or None before the first frame."""
         return self.frames[-1] if self.frames else None
 
     def frame(self, at: int) -> KeptFrame | None:
-        """Return the frame numbered `at`, or the nearest one that is kept; None before the first frame."""
+        """Return the kept frame whose number is nearest to `at`, or None before the first frame."""
         if not self.frames:
             return None
         return self.frames[min(max(at - self.frames[0].at, 0), len(self.frames) - 1)]
 
     def add(self, outcome: FrameOutcome, now_s: float) -> KeptFrame:
-        """Add a frame at a time of a monotonic clock in seconds, and tell the watchers."""
+        """Add a frame and call the watchers. `now_s` is the frame's time on a monotonic clock, in seconds."""
         report = outcome.report if isinstance(outcome, Posterior) else outcome
         details = report.details if report else outcome.details
         values = None
@@ -158,7 +158,7 @@ class Feed:
         return frame
 
     def add_loss(self, reason: str) -> None:
-        """Count a frame that has no posterior; beyond `_MAX_REASONS` reasons, new ones are counted together."""
+        """Count a frame without a posterior under its reason. After `_MAX_REASONS` reasons, new ones count as `OTHER`."""
         known = reason in self.lost or len(self.lost) < _MAX_REASONS
         self.lost[reason if known else OTHER] += 1
 
@@ -168,7 +168,7 @@ class Feed:
             watcher()
 
     def rate(self, now_s: float) -> float:
-        """Return frames per second over the last `RATE_SECONDS` whole seconds."""
+        """Return the mean number of frames per second in the last `RATE_SECONDS` whole seconds."""
         last = int(now_s)
         recent = [each for each in self._seconds if last - RATE_SECONDS <= each.start < last]
         # from the first frame on, as in the other processes' rates
@@ -176,7 +176,7 @@ class Feed:
         return sum(each.frames for each in recent) / max(min(RATE_SECONDS, last - first), 1)
 
     def stage_times(self, now_s: float) -> list[tuple[int, list[float]]]:
-        """Return the mean microseconds of each stage, a row per second with its age in seconds, the oldest first."""
+        """Return one row per second, the oldest first: the second's age, and the mean microseconds of each stage."""
         rows = []
         for second in self._seconds:
             means = [total / max(count, 1) for total, count in zip(second.sums, second.counts, strict=True)]

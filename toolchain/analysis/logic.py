@@ -72,10 +72,10 @@ _FEW_WORDS: Final = 8
 
 
 class Of(StrEnum):
-    """The kinds of units in which a machine's logic is counted, each with the VHDL that one unit stands for."""
+    """The units in which a machine's logic is counted. The text of each unit names the VHDL that contains it."""
 
     BOARD = "board"
-    """The units that each board has once: bm1_axi, bm_register_block, bm1_guard, and one machine's bm1_control."""
+    """What each board has once: bm1_axi, bm_register_block, bm1_guard, and bm1_control for one machine."""
     CODE_BIT = "code bit"
     """A bit of a cell's code, in bm1_stochastic_bitstream_generator.
 
@@ -87,26 +87,26 @@ class Of(StrEnum):
     The logic of the bit increments the counter, compares the count with the target, and selects the bit for the host.
     """
     STATE_BIT = "state bit"
-    """A bit of the state of an LFSR (bm1_lfsr): its logic loads the seed, or the state after a cycle's steps."""
+    """A bit of an LFSR's state, in bm1_lfsr. Its logic loads the seed, or the state after the steps of a cycle."""
     STEP = "step"
-    """A step of an LFSR in a cycle (bm1_lfsr): the parity of the taps."""
+    """One of the steps of an LFSR in a cycle, in bm1_lfsr. Its logic computes the parity of the taps."""
     PLACE_BIT = "place bit"
-    """A bit of the index in a table of random numbers (bm1_table_player): its logic computes the next index."""
+    """A bit of the index in a table of random numbers, in bm1_table_player. Its logic computes the next index."""
     WORD = "word"
-    """A word that the host writes for a frame, in bm1_words: its logic decodes the address and checks the value."""
+    """A word that the host writes for a frame, in bm1_words. Its logic decodes the address and checks the value."""
     MEMORY = "memory"
-    """A whole memory of the words that the host writes, in bm1_words: the logic that fills it at first and reads it."""
+    """A memory of the words that the host writes, in bm1_words. Its logic fills the memory at first, and reads it."""
     REPLICA = "replica"
-    """One of several replicas, in bm1_control and bm1_readout: logic of its stop, stop reason, resume and outcome."""
+    """A replica, if there are several. Its logic, in bm1_control and bm1_readout, handles stop, resume and outcome."""
 
 
 WORST_ERROR: Final = 0.06
-"""Maximum relative error of ALUTs and ALMs that `scripts/verify resources` accepts."""
+"""Maximum relative error that `scripts/verify resources` accepts in the estimates of ALUTs and ALMs."""
 
 
 @dataclass(frozen=True, slots=True)
 class Cost:
-    """Logic of an FPGA for one unit: look-up tables, including carry chains, and the ALMs that hold them."""
+    """FPGA logic of one unit: the look-up tables (ALUTs), including carry chains, and the ALMs that hold them."""
 
     aluts: float
     alms: float
@@ -137,7 +137,7 @@ class LogicPart:
 
     @property
     def aluts(self) -> float:
-        """Look-up tables of all kinds, including carry chains."""
+        """Number of look-up tables, including carry chains."""
         return sum(count * COSTS[of].aluts for of, count in self.counts.items())
 
     @property
@@ -169,14 +169,14 @@ class Logic:
 
 
 def state_bits(p: BM1Parameters | BM2Parameters, table_length: int) -> int:
-    """Return the width of a generator's state: an LFSR, or an index in the table of random numbers."""
+    """Return the width of a generator's state, in bits. The state is an LFSR, or an index in the random numbers' table."""
     return p.rng.lfsr_bits or _index_bits(table_length)
 
 
 def logic_of(parameters: BM1Parameters, *, table_length: int = LENGTH, inputs: int = 0) -> Logic:
-    """Return the logic of a machine on a board, without memories; raise a BuildError for ideal generators.
+    """Return the logic of a machine on a board, without memories. Raises a BuildError for ideal generators.
 
-    `inputs` is the number of input words of the board's registers, if it is more than the machine needs.
+    If the board's registers have more input words than the machine needs, `inputs` is the number of these words.
     """
     p = parameters
     if p.rng is RngKind.IDEAL:
@@ -245,16 +245,16 @@ def _index_bits(count: int) -> int:
 MLAB_ALMS: Final = 10
 """Number of ALMs of a memory LAB."""
 MLAB_SHAPE: Final = (64, 10)
-"""Number of words and their width in a memory LAB, in the deeper of its two shapes."""
+"""Number of words and bits per word of a memory LAB. Of the two possible shapes, this is the deeper."""
 MLAB_SHARE: Final = 0.5
-"""Share of the LABs of a Stratix V that can be memories."""
+"""Share of the LABs in a Stratix V that can be used as memories."""
 
 BLOCK_SHAPES: Final = ((512, 40), (1024, 20), (2048, 10), (4096, 5), (8192, 2), (16384, 1))
-"""Number of words and their width in an M20K, for each possible shape."""
+"""The possible shapes of an M20K: number of words, and bits per word."""
 
 
 def blocks_of(words: int, width: int) -> int:
-    """Return the minimum number of M20Ks that hold a table."""
+    """Return the minimum number of M20Ks that hold `words` words of `width` bits."""
     return min(math.ceil(words / deep) * math.ceil(width / wide) for deep, wide in BLOCK_SHAPES)
 
 
@@ -274,7 +274,7 @@ class EqualMemories:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Memories:
-    """The memories of a machine; `logic_tables` is the number of tables in memory LABs, for which no block was left."""
+    """The memories of a machine. `logic_tables` tables are in memory LABs because no memory block was left for them."""
 
     table_bits: int
     blocks: int
@@ -284,7 +284,7 @@ class Memories:
 
 
 def tables_of(p: BM1Parameters) -> list[EqualMemories]:
-    """Return the tables of codes: one per column if its cells share an address, otherwise one per cell.
+    """Return the tables of codes. A column has one table if its cells share an address, otherwise one table per cell.
 
     Every replica has its own tables, because it uses its own addresses. A prior of one row, whose MIF has one word, is
     not a memory but a constant.
@@ -305,7 +305,7 @@ def random_memories_of(p: BM1Parameters | BM2Parameters, table_length: int) -> l
 
 
 def word_memories_of(p: BM1Parameters, inputs: int = 0) -> list[EqualMemories]:
-    """Return the memories of the words that the host writes (bm1_words), and of a written prior's initial codes."""
+    """Return the memories of the words that the host writes (bm1_words). A written prior adds one for initial codes."""
     used = BM1.registers(p)
     depths = [max(inputs, used.input_words, 1)]
     initial = []
@@ -321,7 +321,7 @@ def word_memories_of(p: BM1Parameters, inputs: int = 0) -> list[EqualMemories]:
 def place_memories(
     parameters: BM1Parameters, device: Device, table_length: int = LENGTH, inputs: int = 0
 ) -> Memories:
-    """Place tables, the deepest first, in the M20Ks that other memories leave free; place the other tables in MLABs."""
+    """Place tables in the M20Ks that other memories leave free, the deepest first. Memory LABs hold the other tables."""
     tables = tables_of(parameters)
     room = math.floor(device.usable * device.blocks)
     others = random_memories_of(parameters, table_length) + word_memories_of(parameters, inputs)

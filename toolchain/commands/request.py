@@ -32,7 +32,7 @@ ModelPath: TypeAlias = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class ModelFlags:
-    """Flags for reading a model: parameters of model.py, or variables of a network."""
+    """Flags that describe a model: the parameters of a `model.py`, or the variables of a network file."""
 
     settings: Settings = None
     searched: Annotated[str, typer.Option(help="Searched variables.", metavar="A,B")] = ""
@@ -57,7 +57,7 @@ class ModelFlags:
     )
 
     def over(self, built: ModelSection) -> "ModelFlags":
-        """Return these flags; flags that are not set get the values in `built`, the `[model]` of a deployment."""
+        """Return these flags. Unset flags get their values from `built`, the section `[model]` of a deployment."""
         found = {
             each.name: getattr(self if getattr(self, each.name) != each.default else built, each.name)
             for each in fields(ModelFlags)
@@ -115,7 +115,7 @@ class BuildFlags(MachineOptions, ModelFlags):
 
 
 def model_file(path: Path) -> Path:
-    """Return the file of a model, which is a network file or a folder's `model.py`, or raise a ToolchainError."""
+    """Return the file that defines a model: a network file or a folder's `model.py`. Raises a ToolchainError."""
     if is_network(path):
         open_regular(path, NetworkFileError).close()
         return path
@@ -125,13 +125,13 @@ def model_file(path: Path) -> Path:
 
 
 def read_source(path: Path, flags: ModelFlags) -> "Model | Question":
-    """Return the model or question that a folder's `model.py` defines, or the question of the flags about a network."""
+    """Return the model or question of a folder's `model.py`. For a network file, return the question in the flags."""
     settings = key_values(flags.settings or ())
     return (_network_question if is_network(path) else _case_source)(path, flags, settings)
 
 
 def read_model(path: Path, flags: ModelFlags, bits: Iterable[str] | None = None) -> "Model":
-    """Return the model for a BM1; `bits` are `NAME=BITS`, the address bits of columns."""
+    """Return the model for a BM1. Each of `bits` is `NAME=BITS`, and sets the address bits of a column."""
     from toolchain.building.machine import with_bits
     from toolchain.models.joint import Question
 
@@ -170,7 +170,7 @@ def _case_source(path: Path, flags: ModelFlags, settings: dict[str, str]) -> "Mo
 def build_options(
     flags: BuildFlags, target: TargetOptions, sources: Path | None = None, *, is_checked: bool = False
 ) -> BuildOptions:
-    """Return the options of a build; the file `sources` names several topics, in place of one in flags.
+    """Return the options of a build. If there are several topics, they stand in the file `sources` and not in the flags.
 
     With `is_checked`, the flags that name the topic of the readings may be missing.
     """
@@ -210,7 +210,7 @@ def build_options(
 
 
 def fit_to_device(plan: "MachinePlan", name: str | None) -> tuple["MachinePlan", str]:
-    """Return the plan with enough boards of device `name` (with `--replicas fill`, full boards), and the reasons."""
+    """Return the plan with enough boards of the device, and the reasons. With `--replicas fill`, the boards are full."""
     if name is None:
         return plan, ""
     from toolchain.analysis.logic import device_named
