@@ -27,8 +27,8 @@ class NetworkModel:
     symbols: tuple[Symbol, ...]
     """The variables of the machine, in the order of the joint distribution."""
     factors: tuple[Term, ...]
-    """The factors, each for one conditional distribution encoder (CDE) of the machine. The names in a factor's scope are
-    in the order of `symbols`.
+    """The factors, each for one conditional distribution encoder (CDE) of the machine. The names in a factor's scope
+    are in the order of `symbols`.
     """
     titles: tuple[str, ...]
     """The name of each factor, such as P(A | B)."""
