@@ -68,7 +68,7 @@ class BM1Kind(MachineKind):
         return BM1Machine(parameters, sections["prior"], columns, sections.get("rng"))
 
     def registers(self, parameters: BM1Parameters) -> UsedRegisters:
-        """Return the registers of a board. Readings are in SENSORS; with replicas or inputs per cell, in INPUTS."""
+        """Return the registers of a board. With replicas or inputs per cell, it has INPUTS instead of SENSORS."""
         inputs, results = math.prod(parameters.input_shape), math.prod(parameters.count_shape)
         size = f"{parameters.sensors} sensors and {parameters.lines} lines"
         if not _is_plain(parameters):
@@ -163,7 +163,7 @@ class BM1Kind(MachineKind):
     def posterior(
         self, machines: Sequence[BM1Machine], frame: FrameInput, _: Sequence[str] = ()
     ) -> tuple[npt.NDArray[np.float64], Mapping[str, str]]:
-        """Run the machines with `machines.posterior.posterior`. Return the posterior, and no details."""
+        """Run the machines with `machines.posterior.posterior`. Return the posterior and an empty mapping."""
         values = posterior(
             machines,
             frame.addresses,

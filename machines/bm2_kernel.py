@@ -16,7 +16,7 @@ from machines.rng import Words, random_numbers, sequencer_seed
 class BM2Kernel(ABC):
     """A kernel that runs a BM2: one chain of samples (thesis 2.1.3).
 
-    All subclasses are equal bit for bit: equal calls lead to equal results and an equal state.
+    After the same calls, all subclasses have the same results and state, bit for bit.
     """
 
     def __init__(self, machine: BM2Machine) -> None:

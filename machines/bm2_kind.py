@@ -44,7 +44,7 @@ The means of the batches show how much samples depend on each other.
 """
 
 STREAM_BYTES_MAX: Final = 3 << 20
-"""Maximum size in bytes of the streams of all boards in a frame, because one message between services has them all."""
+"""Maximum size in bytes of a frame's streams on all boards, because one message between services contains them all."""
 
 _STARTS_KEPT: Final = 4096  # start states that a host remembers
 _ORDERS: Final = tuple(Sequencer)
@@ -72,8 +72,8 @@ class BM2Kind(MachineKind):
     def due_sections(self, parameters: BM2Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
         """Yield the name, type and shape of each section that a file must have.
 
-        Each CDE has a section, and so has each factor (its non-zero entries). The last section is the table of random
-        numbers, if the machine has it.
+        Each CDE has a section. Each factor has a section that marks the factor's non-zero entries. The last section is
+        the table of random numbers, if the machine has this table.
         """
         for at in range(parameters.cdes):
             bits = len(parameters.factor_bits(at))

@@ -38,21 +38,20 @@ from machines.parameters import BM1Parameters, PriorMode, RngKind, RngReset
 from machines.rng import LFSR, LFSRNumbers, Words, jump_tables
 
 KEPT_BYTES: Final = 64 * 2**20
-"""Maximum size in bytes of a machine's cache of words. The operating system allocates only the used part."""
+"""Maximum size in bytes of a machine's cache of random bits. The operating system allocates only the used part."""
 
 KEPT_CYCLES: Final = 2**17
-"""The words of at most this many cycles, counted from the start of a frame, are cached."""
+"""The random bits of at most this many cycles, counted from the start of a frame, are cached."""
 
 PREPARED_CYCLES: Final = 2**14
-"""`prepare` computes the words of at most this many cycles, counted from the start of a frame."""
+"""`prepare` computes the random bits of at most this many cycles, counted from the start of a frame."""
 
 
 class FastBM1(BM1Kernel):
     """A kernel for shared LFSRs that runs many cycles at a time (thesis 2.1.2 and 4.4).
 
-    If each frame restarts the generators from a bank, a cache of at most `kept_bytes` bytes keeps the words of random
-    bits between frames. Without a restart, or if the cache is too small for a block of every bank, each frame computes
-    its own words.
+    If each frame restarts the generators from a bank, a cache of at most `kept_bytes` bytes keeps random bits between
+    frames. Without restarts, or if the cache is too small for a block of every bank, each frame computes its own bits.
 
     Raises:
         MachineError: The generators of the machine are not LFSRs, or are not shared.
@@ -111,7 +110,7 @@ class FastBM1(BM1Kernel):
         return 0 if self._of_frame else self._kept_blocks * BLOCK_CYCLES
 
     def prepare(self) -> None:
-        """Cache the words of the first `PREPARED_CYCLES` cycles of every bank, or fewer if the cache is smaller."""
+        """Cache the bits of the first `PREPARED_CYCLES` cycles of every bank, or fewer if the cache is smaller."""
         blocks = min(self.kept_cycles, PREPARED_CYCLES) // BLOCK_CYCLES
         for bank in range(self.machine.parameters.rng_banks if blocks else 0):
             self._restart(bank)

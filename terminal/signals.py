@@ -70,7 +70,7 @@ def received_stop() -> StoppedError | None:
 
 
 def check_signals() -> None:
-    """Raise a StoppedError if a signal has arrived. Call this before blocking, because its first error may be lost."""
+    """Raise a StoppedError if a signal has arrived. Call this before blocking: the signal's exception may be lost."""
     if stop := received_stop():
         raise stop
 

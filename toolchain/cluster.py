@@ -57,11 +57,11 @@ class Job(Protocol):
     """Numbered pieces of work that use the same tables. Jobs and results must be picklable."""
 
     def prepare(self) -> Work:
-        """Return the function that does one piece of work, and returns its result. It takes the number of the piece."""
+        """Return a function that takes the number of a piece of work, does the piece, and returns the result."""
 
 
 Run: TypeAlias = Callable[[Job, Sequence[int], Keep], None]
-"""A function that does the pieces with the given numbers, and calls `keep` for each result as soon as it has it."""
+"""A function that does the pieces with these numbers, and passes each result to `keep` as soon as it has the result."""
 
 
 def in_this_process(job: Job, numbers: Sequence[int], keep: Keep) -> None:
@@ -214,7 +214,7 @@ async def _greet(address: str, arguments: dict[str, Any]) -> None:
 
 @cache
 def software() -> str:
-    """Return a hash of this host's software that affects results: rosbayes, NumPy, Numba and SciPy."""
+    """Return a hash of the software on this host that affects results: rosbayes, NumPy, Numba and SciPy."""
     digest = sha256()
     for name in ("numpy", "numba", "scipy"):
         with suppress(metadata.PackageNotFoundError):

@@ -42,7 +42,7 @@ class NotFusionError(ModelError):
 
 
 class NetworkFileError(ModelError):
-    """A network file is damaged, hostile, or of another format. The error names the file and the line."""
+    """A network file is missing, damaged or too large, or is not a network. The error names the file and the line."""
 
 
 class MifError(ToolchainError):

@@ -88,7 +88,7 @@ class Reader(Protocol):
         """Count a message that was discarded because it is larger than `max_bytes`."""
 
     def leave_out(self, reason: str) -> None:
-        """Record that the topic is left out, because a message was too large. Reading then raises an error."""
+        """Record that the client leaves the topic out, because a message is too big. Reading then raises an error."""
 
     def add_blind_seconds(self, seconds: float) -> None:
         """After a reconnection, add the seconds without a connection to `blind_seconds`."""
@@ -468,7 +468,7 @@ class Session:
         return nullcontext() if websocket is None else websocket.together()
 
     async def wait_turn(self, what: str, limit: float) -> None:
-        """Wait until the server has accepted all previous messages. The text of an error calls the message `what`."""
+        """Wait until the server has accepted all previous messages. `what` is the name of the new message in errors."""
         self._waiting += 1
         try:
             async with asyncio.timeout(limit), self._turn:
@@ -488,7 +488,7 @@ class Session:
                 websocket.count_unread(len(message))
 
     def watch_silence(self) -> None:
-        """Start to check for silent subscriptions. The checks end once each has had a message on this connection."""
+        """Check for silent subscriptions, until each subscription has had a message on this connection."""
         self._renewal_delay = SILENCE
         if self._websocket is not None:
             self._schedule_renewal()

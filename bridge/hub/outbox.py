@@ -122,7 +122,7 @@ class Outbox:
         return self.undroppable > 0 and self.undroppable + self._largest > self._max_bytes
 
     def put(self, payload: bytes, fragment_size: int = 0) -> None:
-        """Queue an answer or a request of a service or an action. The outbox never drops it."""
+        """Queue an answer or a request of a service or an action. If the queue has no room, set `overflowed`."""
         if self._bypass(payload, fragment_size):
             return
         # Messages of topics are dropped for an answer, never the reverse.

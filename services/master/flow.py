@@ -147,7 +147,7 @@ class FrameFlow:
         count: int | None,
         show: Callable[[Published], None],
     ) -> None:
-        """Start without frames. With `once`, the run ends after one frame. With `count`, it ends after `count` results."""
+        """Start without frames. If `once` is set, one frame ends the run. If `count` is set, `count` results end it."""
         self._settings = settings
         self._deployment = deployment
         self._peers = peers

@@ -119,7 +119,7 @@ class StampGap:
     """A gap between the stamps of two topics. The gap exceeds the tolerance, so no frame is formed."""
 
     oldest: str
-    """The topic with the oldest last message, by stamp. `newest` is the topic with the newest last message."""
+    """The topic whose last message has the oldest stamp."""
     newest: str
     apart_s: float
     tolerance_s: float

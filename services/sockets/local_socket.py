@@ -1,7 +1,7 @@
 """Local sockets between services: length-prefixed MessagePack records, and the handshake.
 
 A framed record begins with four bytes (little-endian) that give the number of bytes of MessagePack after them.
-`RecordSplitter` decodes records and performs no I/O. `RecordProtocol` connects it to asyncio.
+`RecordSplitter` decodes records and performs no I/O. `RecordProtocol` is a connection in asyncio.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def check_hello(record: AnyRecord, expected_role: str, deployment_hash: str, whe
 
 
 class RecordProtocol(asyncio.Protocol):
-    """The asyncio protocol of a local connection. It passes each received record to a callback, without a task."""
+    """The asyncio protocol of a local connection. It passes each received record directly to a callback."""
 
     def __init__(
         self,

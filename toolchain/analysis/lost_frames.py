@@ -41,7 +41,7 @@ _MOST_CYCLES: Final = 2**26
 
 
 class LostFrames(NamedTuple):
-    """The expected share of lost frames, a clause about the lost frames, and advice. With few, the advice is empty."""
+    """The expected share of lost frames, a clause about it, and advice. If few frames are lost, the advice is empty."""
 
     share: float
     what: str

@@ -63,8 +63,9 @@ class Quantised:
     """The codes of a model for all lines, before the lines are divided among boards."""
 
     prior: NDArray[np.uint16]
-    """uint16[rows, lines], with one row. If a variable selects the prior, there is one row for each of its addresses:
-    the last row is the prior without a selection, and rows of addresses that stand for no value contain 0.
+    """uint16[rows, lines]: one row or, if a variable selects the prior, one row for each address of the variable.
+
+    In the second case, the last row is the prior without a selection. Rows of addresses without a value contain 0.
     """
     tables: tuple[NDArray[np.uint16], ...]
     """uint16[2**bits, lines] per known variable. Rows of addresses that stand for no value contain 0. The last row is
@@ -88,7 +89,7 @@ def quantise(
     """Convert the probabilities of a model to codes of `prob_bits` bits (1 to 16), and compute the quantisation loss.
 
     `scale` says whether each row, the whole table or nothing is first divided by its maximum. If each cell has its own
-    reading, the rows must not be divided (`Scale.ADDRESS`).
+    reading, `scale` must not be `Scale.ADDRESS`.
     """
     prior = model.prior_distribution
     prior_codes, prior_loss = _quantised_prior(model, prob_bits, scale)

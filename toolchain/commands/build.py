@@ -44,7 +44,7 @@ def build(
     target: TargetOptions,
     sources: SourcesFlag = None,
 ) -> None:
-    """Build a deployment: programming files, deployment.toml and a report. A BM1 also gets a hardware project.
+    """Build a deployment: programming files, deployment.toml and a report. For a BM1, also write a hardware project.
 
     `toolchain build casestudies/boat -o build/boat --partitions 4 --uri ws://localhost:9090
     --topic /boat/sensors --type boat_msgs/Sensors`

@@ -1,4 +1,4 @@
-"""Models: searched and known variables, and the exact posterior (thesis 2.1.2, 3.4). A `model.py` imports them."""
+"""Models: searched and known variables, and the exact posterior (thesis 2.1.2, 3.4). A `model.py` imports from here."""
 
 from toolchain.models.distribution import (
     IntegerType,

@@ -104,7 +104,7 @@ def seed_width(machine: BM1Machine | BM2Machine) -> int:
 
 
 def packed_words(codes: NDArray[np.uint16], prob_bits: int) -> Iterator[int]:
-    """Yield one word per row of `codes`, uint16[rows, lines]. Each code has `prob_bits` bits; line 0 is lowest."""
+    """Yield one word per row of `codes`, uint16[rows, lines]. The code of line 0 is in the lowest `prob_bits` bits."""
     weights = np.arange(prob_bits - 1, -1, -1, dtype=np.uint16)
     for start in range(0, len(codes), _ROWS_AT_ONCE):
         rows = codes[start : start + _ROWS_AT_ONCE, ::-1]
