@@ -1,4 +1,4 @@
-"""Shared code of case studies: lossy publications, readiness, and frames with the robot's true positions."""
+"""Shared code of case studies: publications that drop messages, readiness, and frames with true positions."""
 
 import asyncio
 import contextlib
@@ -32,7 +32,7 @@ from terminal.run_directory import status_directory
 from terminal.signals import run_async
 
 RECENT_S: Final = 10.0
-"""Seconds without work after which a process is not ready."""
+"""Maximum seconds since the last work of a process that is ready."""
 
 
 class Readiness:
@@ -48,12 +48,12 @@ class Readiness:
         self._done = 0
 
     def record(self) -> None:
-        """Record that the process has just done its work."""
+        """Record that the process has just done a step of its work."""
         self._last = time.monotonic()
         self._done += 1
 
     def state(self) -> tuple[bool, str]:
-        """Return whether the process is ready, and why."""
+        """Return whether the process is ready, and the reason as text."""
         if self._last is None:
             return False, f"not yet: {self._work}"
         age = time.monotonic() - self._last
@@ -62,7 +62,10 @@ class Readiness:
 
 @contextlib.asynccontextmanager
 async def connected(name: str, work: str, uri: str) -> AsyncIterator[tuple[Ros, Readiness]]:
-    """Within the context, connect to a server, and report in the run directory how recently the `work` was done."""
+    """Connect to a server within the context, and report the readiness of the process `name` in the run directory.
+
+    `work` describes a step of the work, as in `Readiness`.
+    """
     started, readiness = time.monotonic(), Readiness(work)
 
     def answer() -> bytes:
@@ -82,7 +85,10 @@ async def connected(name: str, work: str, uri: str) -> AsyncIterator[tuple[Ros, 
 
 
 def run_viewer(watching: Coroutine[Any, Any, None], finish: Callable[[], None]) -> None:
-    """Run a viewer, and call `finish` when it ends, also if Ctrl-C or a lack of results ends it."""
+    """Run a viewer, and call `finish` when the viewer ends.
+
+    If Ctrl-C or a lack of results ends the viewer, `finish` is called, too. After another error it is not called.
+    """
     try:
         run_async(watching)
     except (NoResultError, StoppedError) as ended:
@@ -118,8 +124,8 @@ async def report_refused(
 class LossyPublication:
     """A publication that drops messages while the server is disconnected or slow.
 
-    A message that is too large for the server is dropped, too. The user is warned of slowness and of size,
-    each once until messages are published again.
+    A message that is too large for the server is dropped, too. The user gets one warning if the server is slow, and one
+    if a message is too large. After a successful publication, both warnings can appear again.
     """
 
     def __init__(self, publication: Publication) -> None:
@@ -129,7 +135,7 @@ class LossyPublication:
         self._slow = self._large = False
 
     async def publish(self, message: Mapping[str, Any]) -> bool:
-        """Publish the message or drop it, and return whether it was published."""
+        """Publish or drop the message. Return True if the message was published."""
         try:
             await self._publication.publish(message)
         except DisconnectedError:
@@ -164,10 +170,10 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Instance:
-    """The outcome of a frame, received from the topics of results, and the true position at its time.
+    """The outcome of a frame, received from the topics of results, and the true position at the frame's time.
 
-    `truth` is None if no true pose matches the stamp. `truth_age_ns` is the age of the true pose relative to the
-    frame's stamp, 0 if the stamps are equal.
+    `truth` is None if no true pose matches the stamp of the frame. `truth_age_ns` is the stamp of the frame minus the
+    stamp of the true pose, in ns.
     """
 
     heard: FrameOutcome
@@ -176,12 +182,12 @@ class Instance:
 
     @property
     def posterior(self) -> Posterior | None:
-        """The posterior, or None for a frame without one."""
+        """The posterior of the frame, or None if the frame has no posterior."""
         return self.heard if isinstance(self.heard, Posterior) else None
 
     @property
     def report(self) -> FrameReport | None:
-        """The frame's report on `/bm/frame`, or None for a posterior that no report announced."""
+        """The report of the frame on `/bm/frame`, or None if a posterior arrived without a report."""
         return self.heard.report if isinstance(self.heard, Posterior) else self.heard
 
 
@@ -207,7 +213,7 @@ _POSE: Final = TypeAdapter(_PoseStamped)
 
 
 def read_truth(message: dict[str, Any], topic: str) -> Truth:
-    """Return a geometry_msgs/PoseStamped as a true position, or raise a BadResultError."""
+    """Return the true position in a geometry_msgs/PoseStamped from `topic`, or raise a BadResultError."""
     pose = validated(_POSE, message, topic, TRUTH_TYPE)
     return Truth(stamp_ns=pose.header.stamp, x=pose.pose.position.x, y=pose.pose.position.y)
 
@@ -240,7 +246,7 @@ class Listener:
 
     @property
     def announced_only(self) -> int:
-        """The number of frames that `/bm/frame` announced and whose result never arrived."""
+        """The number of frames that `/bm/frame` announced, but for which no result arrived."""
         return self._heard.announced_only
 
     async def next(self, limit_s: float) -> Instance:
@@ -307,9 +313,10 @@ class Listener:
 async def listen(
     ros: Ros, *, truth_topic: str | None = None, truth_tolerance_s: float = 0.0
 ) -> AsyncIterator[Listener]:
-    """Subscribe to `/bm/frame`, `/BMresults` and, if given, a geometry_msgs/PoseStamped topic of true poses.
+    """Listen to the frames on `/bm/frame` and `/BMresults`, and to true poses on `truth_topic` if it is given.
 
-    A true pose belongs to a frame if it has the same stamp, or is older by at most the tolerance.
+    True poses are geometry_msgs/PoseStamped. A true pose belongs to a frame if the stamps are equal, or if the pose is
+    older by at most `truth_tolerance_s` seconds.
     """
     async with contextlib.AsyncExitStack() as stack:
         heard = await stack.enter_async_context(posteriors(ros, queue_size=_QUEUE_SIZE))

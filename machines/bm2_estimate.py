@@ -1,4 +1,4 @@
-"""Estimates from the samples of a BM2: posterior, its error, effective samples and R-hat over all boards."""
+"""Estimates from a BM2's samples on all boards: posterior, standard error, number of effective samples, and R-hat."""
 
 import math
 from collections.abc import Sequence
@@ -11,7 +11,7 @@ import numpy.typing as npt
 from machines.bm2 import BM2Parameters, BM2StopReason, unpack_all
 
 BATCHES_MIN: Final = 20
-"""Minimum number of batches for computing the effective samples from the batches' means."""
+"""Minimum number of batches for an estimate of the effective samples from the means of batches."""
 
 AGREE: Final = 1.1
 """Maximum R-hat at which boards count as agreeing on one distribution (Gelman and Rubin 1992)."""
@@ -58,10 +58,10 @@ class ChainEstimate:
 
 
 def searched_counts(parameters: BM2Parameters, results: npt.NDArray[np.integer]) -> npt.NDArray[np.integer]:
-    """Return the counts of the searched variables' joint values, row-major: integers[..., product of cardinalities].
+    """Return the counts of the searched variables' joint values: integers[..., product of cardinalities], row-major.
 
-    The results are integers[..., result_words]. If they have no joint histogram, only one variable may be searched: its
-    own histogram has the counts.
+    `results` is integers[..., result_words]. If a machine has no joint histogram, only one variable may be searched.
+    The counts are then from the histogram of this variable.
     """
     first = parameters.histogram_words
     if not parameters.joint_words:
@@ -75,9 +75,9 @@ def searched_counts(parameters: BM2Parameters, results: npt.NDArray[np.integer])
 
 
 def searched_values(parameters: BM2Parameters, stream: npt.NDArray[np.uint32]) -> npt.NDArray[np.int64]:
-    """Return the index of each state's searched joint value; -1 if it has an unused code.
+    """Return for each state the index of the searched variables' joint value, or -1 if a variable has an unused code.
 
-    The stream is uint32[samples, state_words].
+    `stream` contains the states, uint32[samples, state_words].
     """
     codes = unpack_all(parameters.cardinalities, stream)
     values = np.zeros(len(stream), dtype=np.int64)
@@ -128,10 +128,11 @@ def standard_error(probabilities: Floats, effective: Floats | float) -> Floats:
 
 
 def effective_samples(values: npt.NDArray[np.integer], size: int) -> Floats:
-    """Return the number of effective samples of each value's indicator, by Geyer's initial positive sequence (1992).
+    """Return for each value the number of effective samples of the value's indicator: float64[size].
 
-    It is at most the number of samples, and equal to it for a value that all samples have, or none. The values are
-    integers[samples] from 0 to `size` - 1; the result is float64[size].
+    The method is Geyer's initial positive sequence (1992). `values` is integers[samples] from 0 to `size` - 1. The
+    number of effective samples is at most the number of samples. If all samples or no samples have a value, both
+    numbers are equal.
     """
     samples = len(values)
     padded = 1 << (2 * samples - 1).bit_length()  # so that the correlations do not wrap around
@@ -149,11 +150,11 @@ def effective_samples(values: npt.NDArray[np.integer], size: int) -> Floats:
 
 
 def batch_effective_samples(counts: npt.NDArray[np.integer]) -> Floats:
-    """Return the number of effective samples of each value, from the means of a chain's batches.
+    """Return for each value the number of effective samples, from the means of a chain's batches: float64[values].
 
-    It is at most the number of samples, and equal to it for a value that is equally frequent in all batches. The counts
-    are integers[batches, values], cumulative; the result is float64[values], NaN if fewer than `BATCHES_MIN` batches
-    have samples.
+    `counts` is integers[batches, values], and cumulative over the batches. The number of effective samples is at most
+    the number of samples. If a value is equally frequent in all batches, both numbers are equal. If fewer than
+    `BATCHES_MIN` batches have samples, the result is NaN.
     """
     of_batch = np.diff(counts.astype(np.float64), axis=0, prepend=0)
     of_batch = of_batch[of_batch.any(axis=1)]
@@ -170,10 +171,10 @@ def batch_effective_samples(counts: npt.NDArray[np.integer]) -> Floats:
 
 
 def split_r_hat(counts: npt.NDArray[np.integer]) -> Floats:
-    """Return the split R-hat of each value's indicator (Gelman et al. 2013), from the counts of half chains.
+    """Return for each value the split R-hat of the value's indicator (Gelman et al. 2013): float64[values].
 
-    For a value that is constant within every half, R-hat is 1 if all halves agree, else infinite. The counts are
-    integers[halves, values], with 2 or more samples in each half; the result is float64[values].
+    `counts` has the counts of each half of a chain, integers[halves, values]. Each half needs at least 2 samples. If an
+    indicator is constant within every half, R-hat is 1 if all halves agree, and otherwise infinite.
     """
     n = counts.sum(axis=1, keepdims=True).astype(np.float64)
     means = counts / n

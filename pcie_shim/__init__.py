@@ -1,1 +1,1 @@
-"""Boards: registers, link, emulated board, driver, programming files (thesis 2.3, 3.2)."""
+"""Boards with their registers, link, driver, programming files and emulation (thesis 2.3, 3.2)."""

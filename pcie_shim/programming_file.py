@@ -1,11 +1,11 @@
 """Programming files, which the toolchain builds from a model and the loader sends to a board (thesis 3.4).
 
-A file is a fixed header, a manifest (readable JSON: `head -c 4000 board0.bm`) and the tables of the machine,
-one section each. The header contains the SHA-256 of the manifest, and the manifest the SHA-256 of every section,
-so that an error names the damaged part. The same image and build date always give the same bytes.
+A file consists of a fixed header, a manifest, and a section for each table of the machine. The manifest is readable
+JSON (`head -c 4000 board0.bm`). The header contains the SHA-256 of the manifest, and the manifest contains the SHA-256
+of every section. An error can therefore name the damaged part. Equal images have equal bytes.
 
-`image_hash` identifies the computation: parameters, tables, partition, interface, model and register map, but
-not the date or the version of the tools.
+`image_hash` identifies the computation. It covers the parameters, the tables, the partition, the interface, the model
+and the register map. It does not cover the build date and the version of the tools.
 """
 
 import hashlib
@@ -30,7 +30,7 @@ from pcie_shim.errors import DamagedImageError, ImageError, ImageMismatchError
 from pcie_shim.register_layout import interface_room
 
 MAGIC: Final = b"BMIMAGE\x01"
-"""First bytes of a programming file; the last one is the version of the format."""
+"""First bytes of a programming file. The last of these bytes is the version of the file format."""
 
 MAX_IMAGE_BYTES: Final = 1 << 30
 """Maximum size of a programming file in bytes."""
@@ -126,12 +126,12 @@ class Image:
 
     @property
     def map_hash(self) -> str:
-        """SHA-256 (hex) of this software's register map, for which the image is built."""
+        """SHA-256 (hex) of this software's register map. The image is built for this register map."""
         return register_map.MAP_SHA256
 
     @cached_property
     def image_hash(self) -> str:
-        """SHA-256 (hex) of everything that determines what the board computes, but not of the build date."""
+        """SHA-256 (hex) of everything that determines what the board computes. The build date is not included."""
         return _manifest(self, self.kind.sections(self.machine)).image_hash
 
 
@@ -200,7 +200,7 @@ def tool_version() -> str:
 
 
 def image_bytes(image: Image) -> bytes:
-    """Return the bytes of an image's programming file; equal images give equal bytes."""
+    """Return the bytes of the programming file for an image. Equal images give equal bytes."""
     sections = image.kind.sections(image.machine)
     manifest = _canonical(_manifest(image, sections).model_dump(mode="json"))
     header = _HEADER.pack(MAGIC, len(manifest), 0, hashlib.sha256(manifest).digest())
@@ -208,7 +208,7 @@ def image_bytes(image: Image) -> bytes:
 
 
 def read_image(path: Path) -> Image:
-    """Read the image of a programming file, and check all hashes.
+    """Check all hashes of a programming file, and return the image that it contains.
 
     Raises:
         ImageError: The file cannot be read.
@@ -219,7 +219,7 @@ def read_image(path: Path) -> Image:
 
 
 def read_bytes(path: Path) -> bytes:
-    """Read the bytes of a file, at most as many as `image_from_bytes` accepts, or raise an ImageError."""
+    """Return the first `MAX_IMAGE_BYTES` + 1 bytes of a file, or raise an ImageError if the file cannot be read."""
     try:
         with path.open("rb") as file:
             # one byte more than allowed, to detect a file that is too large

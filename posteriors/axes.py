@@ -1,4 +1,4 @@
-"""The dimensions of posteriors, with units and names of states, and texts that name a cell."""
+"""The dimensions of posteriors with their units and states, and texts for cells."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ _LABEL: Final = 24
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """A dimension of a posterior, with the values of its indices if the deployment is known."""
+    """A dimension of a posterior. `dimension` has the values of the indices, or is None without a deployment."""
 
     label: str
     size: int
@@ -20,16 +20,16 @@ class Axis:
 
     @property
     def unit(self) -> str:
-        """The unit of the axis's values; empty if they have none."""
+        """The unit of the axis's values, or an empty string if the values have no unit."""
         return "" if self.dimension is None else self.dimension.unit
 
     @property
     def has_states(self) -> bool:
-        """True if cells have names instead of values."""
+        """True if the values of the cells are names of states instead of numbers."""
         return self.dimension is not None and bool(self.dimension.states)
 
     def value(self, index: float) -> float | str:
-        """Return the value of an index: a number in its unit, the name of a state, or the index itself."""
+        """Return the value at an index: a number or the name of a state. Without `dimension`, return the index."""
         if self.dimension is None:
             return index
         # a mean over names has no meaning, so indices of states are whole
@@ -38,7 +38,7 @@ class Axis:
         return self.dimension.value(index)
 
     def shown(self, index: float) -> str:
-        """Return the value of an index as text for a terminal."""
+        """Return the value at an index as text for a terminal."""
         value = self.value(index)
         if isinstance(value, str):
             return printable(value)
@@ -46,28 +46,31 @@ class Axis:
 
 
 def deployment_axes(deployment: "Deployment") -> list[Axis]:
-    """Return the dimensions of a deployment's posteriors, in their order."""
+    """Return the axes of a deployment's posteriors, in the order of the posterior's dimensions."""
     return [Axis(dimension.label, dimension.size, dimension) for dimension in deployment.result_dimensions]
 
 
 def reading_order(labels: Sequence[str]) -> list[int]:
-    """Return the indices of labels in the order in which people read them: x before y, whatever the array's order."""
+    """Return the indices of labels, with x before y, and y before z. All other labels keep their places."""
     coordinates = [at for at, label in enumerate(labels) if label.lower() in {"x", "y", "z"}]
     moved = dict(zip(coordinates, sorted(coordinates, key=lambda at: labels[at].lower()), strict=True))
     return [moved.get(at, at) for at in range(len(labels))]
 
 
 def in_words(axes: Sequence[Axis], indices: Mapping[str, float]) -> str:
-    """Return a cell, or a mean, in words: `x -0.5 m, y 2.5 m`, `room hall`, or `cell x 2, y 1` without values."""
+    """Return a cell or a mean as text: `x -0.5 m, y 2.5 m` or `room hall`.
+
+    Without a deployment, the text shows the indices: `cell x 2, y 1`.
+    """
     ordered = [axes[at] for at in reading_order([axis.label for axis in axes])]
     words = ", ".join(f"{printable(axis.label)} {axis.shown(indices[axis.label])}" for axis in ordered)
     return words if any(axis.dimension for axis in axes) else f"cell {words}"
 
 
 def state_in_words(dimensions: "Sequence[Dimension]", codes: Sequence[int]) -> str:
-    """Return a sampled state as text, `rain=yes  grass=wet`.
+    """Return a sampled state as text, such as `rain=yes  grass=wet`. `codes` has a code for each dimension.
 
-    Without dimensions, `codes` are the 32-bit words of the state, which are shown in hexadecimal.
+    Without dimensions, `codes` are the 32-bit words of the state, and the text shows the words in hexadecimal.
     """
     if not dimensions:
         return " ".join(f"{word:08x}" for word in reversed(codes))
@@ -78,7 +81,7 @@ def state_in_words(dimensions: "Sequence[Dimension]", codes: Sequence[int]) -> s
 
 
 def printable(text: str) -> str:
-    """Return received text without control characters, and shortened."""
+    """Return a received text for display. The result is short, and has no control characters."""
     # labels come over the wire: they must not fill the screen, nor control it
     text = text if len(text) <= _LABEL else text[: _LABEL - 3] + "..."
     return text if text.isprintable() else repr(text)

@@ -4,7 +4,7 @@ from terminal.errors import ExitCode
 
 
 class StackError(Exception):
-    """Base class of the services' errors; the text is one sentence for the user."""
+    """Base class of the services' errors. The text of an error is one sentence for the user."""
 
     exit_code: int = ExitCode.USAGE
     """Exit code of a command that ends with this error."""
@@ -19,23 +19,23 @@ class InputLineError(StackError):
 
 
 class LocalSocketError(StackError):
-    """A local socket cannot be created, or bytes from it are not a record."""
+    """A local socket cannot be created, or bytes that arrived on a local socket are not a record."""
 
     exit_code = ExitCode.CHILD
 
 
 class OtherPeerError(StackError):
-    """The process at the other end of a local socket has another role, version or deployment."""
+    """The process at the other end of a local socket has an unexpected role, version or deployment."""
 
 
 class NoDataError(StackError):
-    """The first reading did not arrive in time after the start of the run."""
+    """The first reading of the run did not arrive within the time limit."""
 
     exit_code = ExitCode.ROSBRIDGE
 
 
 class RosbridgeLostError(StackError):
-    """The rosbridge server was lost in a run with `--once`."""
+    """The connection to the rosbridge server was lost in a run with `--once`."""
 
     exit_code = ExitCode.ROSBRIDGE
 
@@ -53,7 +53,7 @@ class BoardFailedError(StackError):
 
 
 class ChildDiedError(StackError):
-    """A process that the master started exited unexpectedly, or too often."""
+    """A process of the run exited unexpectedly or too often, or did not answer in time."""
 
     exit_code = ExitCode.CHILD
 
@@ -65,13 +65,13 @@ class OverflowedQueueError(StackError):
 
 
 class OutdatedError(StackError):
-    """A service's deployment folder has changed since its start, and the master requires the new deployment."""
+    """A service has read its deployment folder before a change, and the master requires the new deployment."""
 
     exit_code = ExitCode.CHILD
 
 
 class ReportedError(StackError):
-    """A failure in another process, with the sentence and the exit code of that process."""
+    """A failure that another process has reported, with the reported sentence and exit code."""
 
     def __init__(self, exit_code: int, sentence: str) -> None:
         super().__init__(sentence)

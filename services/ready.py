@@ -1,6 +1,6 @@
-"""The health check of a container: the readiness of a process as an exit code.
+"""The health check of a container, with the readiness of a process as the exit code.
 
-It imports only a small part of the standard library, because it runs every few seconds.
+The check imports only a small part of the standard library, because it runs every few seconds.
 """
 
 import os
@@ -13,7 +13,7 @@ _USAGE = "usage: python -m services.ready NAME [--run-directory DIR]"
 
 
 def main(arguments: list[str]) -> int:
-    """Return 0 if the process is ready, otherwise 1, also for a usage error (container engines reserve 2)."""
+    """Return 0 if the process is ready, otherwise 1. Usage errors also give 1, because container engines reserve 2."""
     directory = os.environ.get("BM_RUN_DIRECTORY", "")
     # by hand: typer takes ten times as long to import as the check itself
     names: list[str] = []

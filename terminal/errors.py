@@ -37,18 +37,18 @@ class ReaderGoneError(Exception):
 
 
 class ProcessError(Exception):
-    """A process that a command or a script started has failed; the error has that process's exit code."""
+    """A process that a command or a script started has failed. The error has the exit code of this process."""
 
     exit_code: int = ExitCode.CHILD
 
 
 class OutputError(Exception):
-    """A file or folder that a command writes at the user's request cannot be written."""
+    """A command cannot write a file or folder that the user has asked for."""
 
     exit_code = ExitCode.USAGE
 
 
 def exit_code_of(error: BaseException) -> int:
-    """Return the exit code of an error, or `BUG` if it has none."""
+    """Return the exit code of an error, or `ExitCode.BUG` if the error has none."""
     code = getattr(error, "exit_code", ExitCode.BUG)
     return int(code) if isinstance(code, int) else int(ExitCode.BUG)

@@ -26,7 +26,7 @@ from bridge.names import absolute
 _log = logging.getLogger("bridge")
 
 FEEDBACK_QUEUE_SIZE: Final = 64
-"""Maximum number of feedback messages queued for one goal; a further one replaces the oldest."""
+"""Maximum number of queued feedback messages of one goal. A further message replaces the oldest queued message."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class GoalResult:
     """Result of a goal.
 
     Attributes:
-        status: Succeeded, canceled or aborted.
+        status: Whether the goal succeeded, was canceled or was aborted.
         values: Fields of the result.
     """
 
@@ -43,10 +43,11 @@ class GoalResult:
 
 
 class Goal:
-    """A goal that this client has sent: `async for feedback in goal`, then `await goal.result(timeout)`.
+    """A goal that this client has sent. Use `async for feedback in goal`, then `await goal.result(timeout)`.
 
-    The iteration ends with the goal. If the connection is lost, iteration and result fail, because the server then
-    never reports the end of the goal. Leaving `async with` before the goal ends cancels the goal: both fail then, too.
+    The iteration ends when the goal ends. If the connection is lost, the iteration and `result` fail, because the
+    server never reports the end of the goal. If the program leaves `async with` before the goal ends, the goal is
+    cancelled. The iteration and `result` then fail, too.
 
     Attributes:
         action: Name of the action.
@@ -85,7 +86,7 @@ class Goal:
         self._wake()
 
     def fail(self, reason: str) -> None:
-        """End the goal without a result, because the connection was lost."""
+        """End the goal without a result after a loss of the connection. The error's text begins with `reason`."""
         self._fail(DisconnectedError(f"{reason} during a goal of {self.action}"))
 
     def _fail(self, error: BridgeError) -> None:
@@ -104,7 +105,7 @@ class Goal:
         return self._ended.done()
 
     async def cancel(self) -> None:
-        """Ask the server to cancel the goal, if it is active. The status in `result` shows whether the server did."""
+        """If the goal is active, ask the server to cancel it. The status of the result shows whether it was cancelled."""
         self._session.check_thread()
         self._session.core.goals.cancel(self._identity)
         self._session.flush()
@@ -195,15 +196,15 @@ class GoalRequest:
 
     @property
     def canceling(self) -> bool:
-        """True if the sender has cancelled the goal."""
+        """True if the sender of the goal has asked for its cancellation."""
         return self._canceling.is_set()
 
     async def wait_canceling(self) -> None:
-        """Wait until the sender has cancelled the goal."""
+        """Wait until the sender of the goal asks for its cancellation."""
         await self._canceling.wait()
 
     def ask_to_cancel(self) -> None:
-        """Tell the handler that the sender has cancelled the goal."""
+        """Tell the handler that the sender of the goal asks for its cancellation."""
         self._canceling.set()
 
     def feed_back(self, values: Mapping[str, Any]) -> None:
@@ -216,11 +217,11 @@ class GoalRequest:
         self._finish(GoalStatus.SUCCEEDED, values or {})
 
     def abort(self, values: Mapping[str, Any] | str | None = None) -> None:
-        """End the goal without success, with a result or the text of a reason."""
+        """End the goal as aborted. `values` is the result, or a text with the reason."""
         self._finish(GoalStatus.ABORTED, values or {})
 
     def cancel(self, values: Mapping[str, Any] | None = None) -> None:
-        """End the goal as cancelled, with the values reached so far."""
+        """End the goal as cancelled. `values` is the result that the handler has reached so far."""
         self._finish(GoalStatus.CANCELED, values or {})
 
     def _finish(self, status: GoalStatus, values: Mapping[str, Any] | str) -> None:
@@ -275,7 +276,7 @@ class ActionServer(Handle):
         self._register()
 
     def receive(self, event: GoalRequested | CancelRequested) -> None:
-        """Start a goal, or ask its handler to cancel it."""
+        """Start the handler of a requested goal, or tell a running handler about the request to cancel."""
         if isinstance(event, CancelRequested):
             if event.goal in self._goals:
                 self._goals[event.goal][0].ask_to_cancel()
@@ -300,7 +301,7 @@ class ActionServer(Handle):
         task.add_done_callback(lambda _task: self._goals.pop(identity, None))
 
     def lost(self) -> None:
-        """Cancel the handlers after a lost connection, because nobody waits for their results."""
+        """After a loss of the connection, cancel the handlers, because no sender can receive their results."""
         # Each task removes its own entry when it has ended, so the dictionary does not change here.
         for _goal, task in self._goals.values():
             task.cancel()

@@ -29,7 +29,7 @@ import orjson
 from bridge.errors import DecodeError, EncodeError, MessageTooLargeError
 
 MAX_SIZE: Final = 1 << 20
-"""Default maximum size of a message in bytes, in both directions."""
+"""Default maximum size in bytes of a message that is sent or received."""
 MAX_DEPTH: Final = 64
 """Default maximum nesting of objects and arrays. The deepest standard ROS message has about ten levels."""
 
@@ -70,7 +70,7 @@ def excerpt(data: bytes | str) -> str:
 
 
 def text_of(value: Any) -> str:
-    """Return a server's explanation as text; some servers send an object instead of a string."""
+    """Return a server's explanation as text. If the server sent an object instead of a string, the text is JSON."""
     if isinstance(value, str):
         return value
     return "" if value is None else orjson.dumps(value).decode()
@@ -104,7 +104,7 @@ def decode(data: bytes, *, max_size: int = MAX_SIZE, max_depth: int = MAX_DEPTH)
 
 
 def is_deeper(data: bytes, limit: int) -> bool:
-    """Return whether valid JSON is nested deeper than `limit`, without visiting its values."""
+    """Return whether valid JSON has more than `limit` levels of nesting. The JSON is not parsed."""
     if len(data) <= 2 * limit:
         return False
     if len(data) < _SMALL * limit:
@@ -241,7 +241,7 @@ def _in_native_byte_order(value: Any) -> Any:
 
 
 def find_nonfinite(message: Any) -> str | None:
-    """Return where in a message the first NaN or infinity is (`scan.ranges[3]`), or None."""
+    """Return the path of the first NaN or infinity in a message, such as `scan.ranges[3]`, or None if it has none."""
     inner: list[tuple[str, Any]] = [("", message)]
     while inner:
         place, value = inner.pop()
@@ -286,11 +286,11 @@ def envelope_of(data: bytes) -> bytes:
 
 
 def topic_of(envelope: bytes) -> str | None:
-    """Return the topic of an envelope, or None if it is not one.
+    """Return the topic of an envelope, or None if `envelope` is not an envelope.
 
-    An envelope is the text before the message in a publish operation that has only the keys `op`, `topic` and
-    `msg`, the last one being `msg`. To check this, the text is completed with an empty message and a brace, and
-    parsed.
+    An envelope is the text before the message in a publish operation. The operation must have only the keys `op`,
+    `topic` and `msg`, and `msg` must be the last. For the check, an empty message and a brace are appended to the text,
+    and the result is parsed.
     """
     try:
         operation: Any = orjson.loads(envelope + b"{}}")

@@ -1,5 +1,6 @@
-"""Conversion of JSON messages by the types of their fields: to CBOR with typed arrays, and to objects for serialising.
+"""Conversion of JSON messages by the types of their fields.
 
+A message becomes CBOR with typed arrays, or an object that rosbags can serialise.
 Every conversion checks the type, range and number of values before it allocates memory for them.
 """
 
@@ -61,7 +62,7 @@ DUMMY: Final = "structure_needs_at_least_one_member"
 
 
 class Builder:
-    """Builder of rosbags' objects from JSON; absent fields get their default."""
+    """Builder of rosbags' message objects from JSON. An absent field gets the default of its type."""
 
     def __init__(self, store: "Typestore", max_values: int) -> None:
         self._store = store
@@ -120,7 +121,7 @@ class Builder:
 
 
 def fields_of(store: "Typestore", name: str) -> list[Any]:
-    """Return the fields of a type, without the field that ROS 2 adds to an empty message."""
+    """Return the fields of a type, without the field that ROS 2 adds to a type without fields."""
     return [entry for entry in store.fielddefs[name][1] if entry[0] != DUMMY]
 
 
@@ -173,9 +174,10 @@ def _numbers(values: Any, element: str, length: int, place: str) -> list[Any] | 
 def cbor_encoder(
     store: "Typestore", name: str, defaults: Callable[[str], dict[str, Any]], known: dict[str, Encode | None]
 ) -> Encode | None:
-    """Return the function that encodes a message with typed arrays; None if no field has an array of numbers.
+    """Return a function that encodes messages of the type `name` as CBOR with typed arrays.
 
-    `defaults` returns a type's defaults, and `known` stores the functions of nested message types.
+    Return None if messages of this type contain no array of numbers. `defaults` returns the default values of a type's
+    fields. `known` stores the functions for nested message types.
     """
     encoders: dict[str, Encode] = {}
 

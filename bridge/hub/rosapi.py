@@ -1,12 +1,12 @@
-"""Services of ROS's `rosapi` node, answered from the state of the hub.
+"""The services of ROS's `rosapi` node, which the hub answers from its own state.
 
-Clients call them for diagnosis (topics, their types and publishers), for parameters and for the fields of
-messages. Names, fields and types are those of the emulated ROS version (http://wiki.ros.org/rosapi,
-rosapi_msgs); services that exist in only one version are answered in both. Times have the fields of both
-(`secs`, `nsecs` and `sec`, `nanosec`).
+Clients call the services for diagnosis, for parameters and for the fields of messages. Diagnosis includes topics with
+their types and publishers. Names, fields and types are those of the ROS version that the hub emulates
+(http://wiki.ros.org/rosapi, rosapi_msgs). A service that exists in only one version is answered in both versions. A
+time has the fields of both versions: `secs` and `nsecs`, `sec` and `nanosec`.
 
-Parameters are a flat dictionary of the hub from names to JSON. A failure with a parameter is an answer in ROS
-2 (`successful`, `reason`), and a failed call in ROS 1.
+The hub stores parameters in a flat dictionary from names to JSON. If an access to a parameter fails, a hub of ROS 2
+answers with `successful` and `reason`. In a hub of ROS 1, the call fails.
 """
 
 from collections.abc import Callable, Iterable
@@ -24,11 +24,11 @@ from bridge.hub.limits import HubLimits, RefusedOperationError
 from bridge.names import MAX_NAME, absolute, ros1_type, ros2_type
 
 NODE: Final = "/rosapi"
-"""The node that offers the services of rosapi."""
+"""Name of the node that offers the services of rosapi."""
 PREFIX: Final = NODE + "/"
-"""The prefix of rosapi's service names; clients cannot offer services under it."""
+"""Prefix of the names of rosapi's services. Clients cannot offer services with this prefix."""
 ROSOUT: Final = "/rosout"
-"""The topic of ROS's log, which carries the hub's refusals."""
+"""The topic of ROS's log, on which the hub also reports the operations that it refuses."""
 # Topics that a server of ROS 1's actionlib publishes or subscribes to under its name.
 _ACTIONLIB: Final = ("goal", "cancel", "status", "feedback", "result")
 
@@ -50,7 +50,7 @@ class Rosapi:
     def __init__(
         self, graph: Graph, limits: HubLimits, definitions: MessageDefinitions, wall_clock: Callable[[], int]
     ) -> None:
-        """Answer questions about `graph`; `wall_clock` returns nanoseconds since 1970."""
+        """Serve the state in `graph`. `wall_clock` returns the time in nanoseconds since 1970."""
         self._graph = graph
         self._limits = limits
         self._definitions = definitions
@@ -93,7 +93,7 @@ class Rosapi:
                 self._services[f"{kind}_{part.lower()}_details"] = details
 
     def offers(self, service: str) -> bool:
-        """Return whether the hub itself offers a service, given by its absolute name."""
+        """Return whether the hub itself offers the service with this absolute name."""
         return service.startswith(PREFIX) and service.removeprefix(PREFIX) in self._services
 
     def call(self, service: str, args: object) -> Values:
@@ -119,7 +119,7 @@ class Rosapi:
         return answer(*given)
 
     def service_type_name(self, type_name: str) -> str:
-        """Return a service type's name in the form of this ROS version."""
+        """Return the name of a service type in the form that the emulated ROS version uses."""
         return ros2_type(type_name, "srv") if self.ros_version == 2 else ros1_type(type_name)
 
     # --- topics

@@ -44,17 +44,17 @@ class View:
 
     @property
     def frame(self) -> KeptFrame | None:
-        """The frame that is shown; None before the first one."""
+        """The frame that is shown, or None before the first frame."""
         return self._feed.newest if self.at is None else self._feed.frame(self.at)
 
     def pause(self, paused: bool) -> None:
-        """Stay at the frame that is shown, or return to the newest."""
+        """If `paused` is true, stay at the frame that is shown. Otherwise return to the newest frame."""
         frame = self.frame
         self.at = frame.at if paused and frame is not None else None
         self._feed.changed()
 
     def step(self, frames: int) -> None:
-        """Pause, and move by this many frames (back if negative), as far as frames are kept."""
+        """Pause, and move forward by `frames`, or back if `frames` is negative. Stop at the end of the kept frames."""
         if (frame := self.frame) is not None:
             found = self._feed.frame(frame.at + frames)
             self.at = found.at if found is not None else None
@@ -66,7 +66,7 @@ class View:
         self._feed.changed()
 
     def labels(self, frame: KeptFrame) -> tuple[str, ...]:
-        """Return the labels of the marginal that is shown for a frame; the first is the vertical axis."""
+        """Return the labels of the marginal to show for a frame. Of two labels, the first is the vertical axis."""
         if self.chosen and set(self.chosen) <= set(frame.labels):
             return self.chosen
         return default_labels(frame)
@@ -74,7 +74,7 @@ class View:
     def message(
         self, frame: KeptFrame, axes: Sequence[Axis], words: Mapping[str, tuple[str, tuple[str, ...]]]
     ) -> bytes:
-        """Return the message for the frame that is shown; `words` has each variable's unit and states, by name."""
+        """Return the message for a frame to show. `words` maps a known variable's name to its unit and its states."""
         head, picture = _encoded(frame, self.labels(frame), tuple(axes))
         kept = self._feed.frames
         now_ns = time.time_ns()
@@ -99,7 +99,7 @@ def _in_words(reading: list[Any], unit: str, states: tuple[str, ...]) -> list[An
 
 
 def packed(head: dict[str, Any], picture: bytes = b"") -> bytes:
-    """Return the message with this head and picture."""
+    """Return the bytes of a message that consists of a head and a picture."""
     # NaN would be no JSON; orjson writes null
     text = orjson.dumps(head, option=orjson.OPT_SERIALIZE_NUMPY)
     return b"".join((_LENGTH.pack(len(text)), text, picture))
@@ -115,7 +115,7 @@ def default_labels(frame: KeptFrame) -> tuple[str, ...]:
 
 
 def choices(labels: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """Return the label sets whose marginals can be chosen: pairs first, then single variables."""
+    """Return the marginals that a user can choose, each as its labels: pairs first, then single variables."""
     pairs: list[tuple[str, ...]] = [
         pair[::-1] if pair[0] == _ACROSS else pair for pair in combinations(labels, 2)
     ]

@@ -1,4 +1,7 @@
-"""The clock for stamps and ages of readings: this computer's, or with `use_sim_time` a simulation's on `/clock`."""
+"""The clock for stamps and ages of readings.
+
+With `use_sim_time`, it is the clock of a simulation on `/clock`. Otherwise it is the clock of this computer.
+"""
 
 import time
 from collections.abc import Callable
@@ -16,9 +19,9 @@ _MOST_NS: Final = 3600 * 10**9
 
 
 class Clock:
-    """Times for stamps, and ticks for ages.
+    """A clock with a time for stamps, and with ticks for ages.
 
-    A simulation runs at any rate, and may pause or restart. A restart sets its time back, but never the ticks.
+    A simulation runs at any rate, and may pause or restart. A restart sets the time back, but never the ticks.
     """
 
     def __init__(self, *, simulated: bool) -> None:
@@ -30,15 +33,15 @@ class Clock:
         """Time of the last message on /clock, before the first the creation of this object (monotonic seconds)."""
 
     def time_ns(self) -> int:
-        """Return the time for stamps (ns); 0 before the first message of a simulation."""
+        """Return the time for stamps in ns, or 0 before the first message of a simulation."""
         return (self._time or 0) if self.simulated else time.time_ns()
 
     def tick(self) -> int:
-        """Return the nanoseconds of a clock that never goes back, from an arbitrary origin."""
+        """Return the nanoseconds since an arbitrary origin. This number never decreases."""
         return self._tick if self.simulated else time.monotonic_ns()
 
     async def follow(self, ros: Ros, moved: Callable[[], None] | None = None) -> None:
-        """Follow `/clock` until cancelled, and call `moved` after each message."""
+        """Take the time from `/clock` until cancelled, and call `moved` after each message with a valid time."""
         messages = ros.subscribe(
             CLOCK_TOPIC, _CLOCK_TYPE, throttle_rate=_INTERVAL_MS, queue_length=1, queue_size=1
         )

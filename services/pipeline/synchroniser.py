@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import Final, Generic, TypeVar
 
 DEPTH: Final = 64
-"""Maximum number of messages of a topic that wait for the other topics."""
+"""Maximum number of messages of one topic that wait for messages of the other topics."""
 ALIVE_PERIODS: Final = 4
 _INTERVALS: Final = 8
 _UNKNOWN_PERIOD_NS: Final = 1_000_000_000
@@ -26,7 +26,7 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, slots=True)
 class Stamped(Generic[Item]):
-    """A message: `stamp` and `tick` (its receipt, on the monotonic clock) are in ns."""
+    """A message with its stamp and the time of its receipt on the monotonic clock (`tick`), both in ns."""
 
     stamp: int
     tick: int
@@ -88,7 +88,7 @@ class Synchroniser(Generic[Item]):
     """
 
     def __init__(self, needed: Sequence[bool], tolerance_ns: int) -> None:
-        """Start without messages; `needed` says for each topic whether every set must contain it."""
+        """Start without messages. `needed` says for each topic whether every set must have a message of the topic."""
         self.unpaired = 0
         self.deadline: int | None = None
         self.absent: list[int] = []
@@ -100,7 +100,7 @@ class Synchroniser(Generic[Item]):
         self._done = -1
 
     def add(self, at: int, stamp: int, tick: int, item: Item) -> None:
-        """Add a message of the topic with index `at`."""
+        """Add a message of the topic with the index `at`, received at `tick` (ns)."""
         if self._begun is None:
             self._begun = tick
         topic = self._topics[at]
@@ -117,7 +117,7 @@ class Synchroniser(Generic[Item]):
         topic.waiting.append(Stamped(stamp, tick, item))
 
     def take_set(self, tick: int) -> dict[int, Item] | None:
-        """Return the next set that is complete at this tick (ns), by the topics' indices, or None."""
+        """Return the next set that is complete at `tick` (ns), or None. The keys are the indices of the topics."""
         self.deadline = None
         while (found := self._pivot()) is not None:
             at, pivot = found

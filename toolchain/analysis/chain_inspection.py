@@ -116,7 +116,7 @@ class ChainInspection:
 def inspect_chain(
     deployment: Deployment, model: NetworkModel | None, options: InspectOptions, progress: Progress, run: Run
 ) -> ChainInspection:
-    """Run a deployment's chains on readings, and estimate their costs, or raise a ToolchainError."""
+    """Run a deployment's chains on drawn readings, and estimate the resources, or raise a ToolchainError."""
     machines = [image.machine for image in read_images(deployment)]
     machine, limits, frames = machines[0], deployment.machine, options.frames or _FRAMES
     if options.readings is not None:
@@ -153,7 +153,10 @@ def inspect_chain(
 
 
 def check_same(deployment: Deployment, machine: BM2Machine, model: NetworkModel) -> None:
-    """Raise a BuildError if the model would not build the deployment's machine; edited codes are not compared."""
+    """Raise a BuildError if a build of the model would give another machine than the deployment's.
+
+    If a board's codes were edited, the codes are not compared.
+    """
     p = machine.parameters
     place = {name: at for at, name in enumerate(model.names)}.__getitem__
     scopes = tuple(tuple(map(place, term.scope)) for term in model.factors)

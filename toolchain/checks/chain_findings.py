@@ -1,4 +1,4 @@
-"""Findings about a BM2: clipped factors, unconnected states, too large tables, and related random numbers.
+"""Findings about a BM2: clipped factors, unconnected states, oversized tables, and related random numbers.
 
 A zero of a factor is clipped to the smallest chance that a code can express. The chain therefore enters impossible
 states, but rarely. If there are few states, the resulting error is computed exactly. Otherwise a finding says that the

@@ -1,6 +1,7 @@
 """The conversion of a reading to an address of its column, in plain Python.
 
-`address = floor((value - offset) / step + 0.5)`, then modulo `period` if there is one, then the range check.
+`address = floor((value - offset) / step + 0.5)`. For a periodic variable, the address is then taken modulo `period`.
+The range check comes last.
 """
 
 import math

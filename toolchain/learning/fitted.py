@@ -1,4 +1,7 @@
-"""Files of fits, `.toml` for normals or `.npz` for counted tables, and their use in models."""
+"""Fit files, and the use of their learnt parameters in models.
+
+A fit of normal distributions is a `.toml` file, and a fit of counted tables is an `.npz` file.
+"""
 
 import json
 import math
@@ -33,7 +36,7 @@ _BAD: Final = (zipfile.BadZipFile, zlib.error, KeyError, ValueError, AttributeEr
 
 
 class FittedRecording(Section):
-    """`[[recording]]` of a fit file: a recording used for learning."""
+    """A `[[recording]]` of a fit file. The fit was learnt from the recording."""
 
     file: str
     sha256: str
@@ -54,7 +57,7 @@ class FittedVariable(Section):
 
 
 class FitFile(Section):
-    """The content of a fit file, except counted tables."""
+    """The content of a fit file without the counted tables."""
 
     format: Literal[1] = FORMAT
     method: Literal["normals", "counts"]
@@ -75,21 +78,21 @@ class Fit:
 
     file: FitFile
     tables: Mapping[str, NDArray[np.float64]]
-    """With the method `counts`, P(K | S) of each variable, float64[values, lines]."""
+    """Tables P(K | S), float64[values, lines], by the variable's name. Empty unless the method is `counts`."""
     prior: NDArray[np.float64] | None = None
-    """With the method `counts`, P(S), float64[lines], if it was learnt from the `prior_rows` of the file."""
+    """P(S), float64[lines], or None if no prior was learnt. Only the method `counts` can learn a prior."""
 
 
 def with_fit(model: Model, path: Path | None) -> Model:
-    """Return a model with learnt tables instead of those set by hand, or the unchanged model without a path.
+    """Return the model with tables from the fit file `path`. Without a path, return the model unchanged.
 
-    A ModelError if the fit is for another model. Only a fit of normal distributions may be for another grid.
+    Raises a ModelError if the fit is for another model. Only a fit of normal distributions may be for another grid.
     """
     return model if path is None else apply_fit(model, read_fit(path), str(path))
 
 
 def apply_fit(model: Model, fit: Fit, where: str = "the fit") -> Model:
-    """Return a model with learnt tables; variables that are not in the fit do not change."""
+    """Return the model with the tables of a fit, or raise a ModelError. Tables that are not in the fit do not change."""
     known = {each.name: each for each in model.known}
     for variable in fit.file.variables:
         if variable.name not in known:
@@ -130,7 +133,7 @@ def cell_spread(model: Model, known: Known) -> NDArray[np.float64]:
 
 
 def normal_of(known: Known) -> Normal:
-    """Return the normals from which a variable's table was computed, or raise a ModelError if there are none."""
+    """Return the normal distributions from which a variable's table was computed. Raises a ModelError without any."""
     if known.normal is None:
         raise ModelError(
             f"{known.name} is not normal around a mean in the model; fit it with --method counts"
@@ -139,7 +142,7 @@ def normal_of(known: Known) -> Normal:
 
 
 def mean_slopes(model: Model, known: Known) -> NDArray[np.float64]:
-    """Return the change of a variable's mean per cell along each dimension: float64[dimensions, lines]."""
+    """Return how much a variable's mean changes per cell along each dimension: float64[dimensions, lines]."""
     sizes = tuple(dimension.size for dimension in model.searched)
     mean = normal_of(known).mean.reshape(sizes)
     turn = None if known.period is None else known.period * abs(known.step)
@@ -158,7 +161,7 @@ def mean_slopes(model: Model, known: Known) -> NDArray[np.float64]:
 
 
 def wrapped(away: NDArray[np.float64], turn: float) -> NDArray[np.float64]:
-    """Return differences around a circle of length `turn`, each the shorter way: -turn / 2 to turn / 2."""
+    """Return differences on a circle of length `turn`. Each is taken the shorter way, from -turn / 2 to turn / 2."""
     shorter: NDArray[np.float64] = (away + turn / 2) % turn - turn / 2
     return shorter
 
@@ -179,7 +182,7 @@ def _with_normal(model: Model, known: Known, fitted: FittedVariable, floor: floa
 
 
 def write_fit(path: Path, fit: Fit) -> None:
-    """Write a fit: TOML for normals, NPZ for counts. The same fit gives the same bytes."""
+    """Write a fit of normal distributions as TOML, or of counted tables as NPZ. Equal fits give equal bytes."""
     suffix = ".toml" if fit.file.method == "normals" else ".npz"
     if path.suffix != suffix:
         raise ModelError(f"{path}: the method {fit.file.method} writes a file that ends in {suffix}")
@@ -194,7 +197,7 @@ def write_fit(path: Path, fit: Fit) -> None:
 
 
 def read_fit(path: Path) -> Fit:
-    """Return a fit written by `toolchain fit`, or raise a ModelError."""
+    """Return the fit in a file that `toolchain fit` has written, or raise a ModelError."""
     if path.suffix == ".npz":
         return _read_tables(path)
     file = TomlFile.read(path, ModelError).validated(FitFile)

@@ -56,7 +56,7 @@ class Normal:
     sigma: ArrayLike
     """Standard deviation in the unit of the reading: one number for all lines, or float64[lines]."""
     floor: float = 0.0
-    """Probability added to each bin for outliers. The unit is the probability of a bin centred at the mean."""
+    """Probability added to each bin for outliers, as a fraction of the probability of a bin centred at the mean."""
     outliers: float = 0.0
     """Share of readings that do not depend on S."""
 
@@ -263,7 +263,7 @@ class Model:
 
     @property
     def variables(self) -> tuple[Variable, ...]:
-        """All known variables as entries of `deployment.toml`: the columns, then the variable that selects the prior."""
+        """All known variables as entries of `deployment.toml`, the columns first, then the selection of the prior."""
         return tuple(known.as_variable() for known in self._all_known())
 
     @property

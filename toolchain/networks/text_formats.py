@@ -1,4 +1,4 @@
-"""Readers of network files in plain text: BIF, UAI, and Hugin's NET, over one scanner of words, signs and numbers."""
+"""Readers of network files in plain text: BIF, UAI, and Hugin's NET. All readers use the class `Scanner`."""
 
 import math
 import re
@@ -17,13 +17,13 @@ _SHOWN: Final = 40
 
 
 class Scanner:
-    """A forward scanner; its methods raise a NetworkFileError for an unexpected token."""
+    """A scanner of words, signs and numbers. Its methods raise a NetworkFileError for an unexpected token."""
 
     def __init__(self, data: bytes, path: Path, *, signs: str = "{}()[]|;,", comments: str) -> None:
-        """Scan the bytes of a file.
+        """Start at the beginning of a file.
 
-        Each of `signs` is a token, and ends a word. `comments` is a regular expression for comments; for a comment
-        /* ... */, it matches only the beginning.
+        Each character of `signs` is a token, and ends a word. `comments` is a regular expression for comments. Of a
+        comment /* ... */, the expression matches only the beginning.
         """
         self._path = path
         try:
@@ -41,7 +41,7 @@ class Scanner:
         """True if the last word was quoted."""
 
     def error(self, sentence: str) -> NetworkFileError:
-        """Return an error at the line of the last token."""
+        """Return an error that names the line of the last token."""
         start = self._end - len(self._text[self._start : self._end].lstrip())
         line = self._text.count("\n", 0, start) + 1
         return NetworkFileError(sentence, path=self._path, line=line)
@@ -74,14 +74,14 @@ class Scanner:
             raise self.error(f"expected {wanted!r}, found {_shown(found)}")
 
     def word(self, what: str) -> str:
-        """Consume a word, plain or quoted; `what` names it in errors."""
+        """Consume and return a word, plain or quoted. Errors call the word `what`."""
         found = self.next()
         if not self.quoted and (not found or self._is_sign(found)):
             raise self.error(f"expected {what}, found {_shown(found)}")
         return found
 
     def words(self, end: str, what: str, most: int) -> list[str]:
-        """Consume at most `most` words, with or without commas, and the sign `end` after them."""
+        """Consume at most `most` words and the sign `end`, and return the words. Commas between words are optional."""
         found: list[str] = []
         while True:
             piece = self.next()
@@ -96,7 +96,7 @@ class Scanner:
             found.append(piece)
 
     def scope(self, what: str, most: int) -> tuple[str, list[str]]:
-        """Consume `( CHILD | PARENTS )` or `( CHILD )`; `what` names the child in errors."""
+        """Consume `( CHILD | PARENTS )` or `( CHILD )`, and return child and parents. Errors call the child `what`."""
         self.sign("(")
         child = self.word(what)
         separator = self.next()
@@ -105,14 +105,14 @@ class Scanner:
         return child, self.words(")", "parents", most) if separator == "|" else []
 
     def count(self, what: str, most: int) -> int:
-        """Consume a whole number from 0 to `most`."""
+        """Consume and return a whole number from 0 to `most`. Errors call the number `what`."""
         word = self.word(what)
         if not (word.isascii() and word.isdigit() and len(word) <= 9) or int(word) > most:
             raise self.error(f"expected {what}, 0 to {most}, found {_shown(word)}")
         return int(word)
 
     def numbers(self, end: str, wanted: int, what: str, *, between: str = ",") -> NDArray[np.float64]:
-        """Consume and return numbers, float64[wanted], ignoring the signs `between`; also consume the sign `end`."""
+        """Consume and return numbers up to the sign `end`: float64[wanted]. Signs in `between` separate numbers, too."""
         stop = self._text.find(end, self._end)
         if stop < 0:
             self._start = self._end = len(self._text)
@@ -126,7 +126,7 @@ class Scanner:
         return self._floats(piece.split(maxsplit=wanted), wanted, what, begin)
 
     def next_numbers(self, wanted: int, what: str) -> NDArray[np.float64]:
-        """Consume `wanted` numbers, separated by white space: float64[wanted]."""
+        """Consume and return `wanted` numbers that are separated by white space: float64[wanted]."""
         begin, words = self._end, []
         for _ in range(wanted):
             word = self.next()
@@ -136,7 +136,7 @@ class Scanner:
         return self._floats(words, wanted, what, begin)
 
     def skip(self, end: str) -> None:
-        """Consume everything up to and including the sign `end`, ignoring signs in brackets and quotes."""
+        """Consume everything up to and including the next sign `end` that is not in brackets or quotes."""
         depth = 0
         while True:
             piece = self.next()
@@ -204,10 +204,10 @@ _BIF_COMMENTS: Final = r"//[^\n]*|/\*"
 
 
 def read_bif(data: bytes, builder: NetworkBuilder) -> None:
-    """Read a BIF file.
+    """Read a BIF file into a builder.
 
-    In `table`, the child varies slowest and the last parent fastest. `(a, b) ...` defines the row for these states of
-    the parents, `default ...` all other rows.
+    In a `table`, the child varies slowest and the last parent fastest. `(a, b) ...` defines the row for the states `a`
+    and `b` of the parents, and `default ...` defines all other rows.
     """
     text = Scanner(data, builder.path, comments=_BIF_COMMENTS)
     while (block := text.next()) or text.quoted:
@@ -297,7 +297,10 @@ _OTHER_NODES: Final = {"continuous", "utility", "decision", "function"}
 
 
 def read_net(data: bytes, builder: NetworkBuilder) -> None:
-    """Read a NET file of discrete chance nodes. In a table, the parents are in order, and the child varies fastest."""
+    """Read a NET file of discrete chance nodes into a builder.
+
+    In a table, the first parent varies slowest and the child fastest.
+    """
     text = Scanner(data, builder.path, signs="{}()|;,=", comments=_NET_COMMENTS)
     in_class = False
     while (block := text.next()) or text.quoted:
