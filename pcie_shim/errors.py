@@ -1,4 +1,4 @@
-"""Errors of boards and of the link; the text of each is one sentence for the user."""
+"""Errors of boards and of the link. The text of each error is one sentence for the user."""
 
 
 class PcieShimError(Exception):
@@ -8,7 +8,7 @@ class PcieShimError(Exception):
 
 
 class EndpointError(PcieShimError):
-    """An endpoint that is neither `unix:/path` nor `tcp://host:port`, or at which the system cannot listen."""
+    """An endpoint is neither `unix:/path` nor `tcp://host:port`, or the system cannot listen at it."""
 
     exit_code = 2
 
@@ -20,31 +20,31 @@ class CredentialsError(PcieShimError):
 
 
 class ImageError(PcieShimError):
-    """A programming file that cannot be created or used, for example if the model is too large for the interface."""
+    """A programming file cannot be created or used, for example because the model is too large for the interface."""
 
     exit_code = 2
 
 
 class DamagedImageError(ImageError):
-    """A programming file whose bytes have changed since it was written."""
+    """The bytes of a programming file have changed since the file was written."""
 
 
 class ImageMismatchError(ImageError):
-    """An intact programming file for another register map, format or set of boards."""
+    """An intact programming file does not fit this software, the board, or the other boards' files."""
 
 
 class FrameInputError(PcieShimError):
-    """A frame whose addresses, target, prior or bank do not fit the machine."""
+    """The addresses, target, prior or bank of a frame do not fit the machine."""
 
     exit_code = 2
 
 
 class SimulationError(PcieShimError):
-    """A simulation of a board's hardware that cannot be started, has ended, hangs, or answers garbage."""
+    """A simulation of a board's hardware cannot be started, has ended, hangs, or gives an invalid answer."""
 
 
 class LinkError(PcieShimError):
-    """An unusable link to a board."""
+    """The link to a board is unusable."""
 
 
 class LinkUnreachableError(LinkError):
@@ -52,7 +52,7 @@ class LinkUnreachableError(LinkError):
 
 
 class LinkClosedError(LinkError):
-    """The other end closed the link, or this handle was closed."""
+    """The other end closed the link, or the caller had closed the handle."""
 
 
 class LinkTimeoutError(LinkError):
@@ -60,15 +60,15 @@ class LinkTimeoutError(LinkError):
 
 
 class FramingError(LinkError):
-    """Bytes that are not a frame: another program listens at the endpoint, or the stream is damaged."""
+    """Received bytes are not a frame. Another program listens at the endpoint, or the stream is damaged."""
 
 
 class CrcError(FramingError):
-    """A frame with a CRC-32 that does not match its header and payload."""
+    """The CRC-32 of a frame does not match the frame's header and payload."""
 
 
 class SequenceError(FramingError):
-    """A frame out of order: lost, repeated, or not the answer to the request."""
+    """A frame was lost or repeated, or an answer does not belong to the request."""
 
 
 class ShortReadError(FramingError):
@@ -80,22 +80,22 @@ class DeviceGoneError(LinkError):
 
 
 class KeyRefusedError(LinkError):
-    """A board and a host that do not have the same key."""
+    """The board and the host do not have the same key."""
 
     exit_code = 2
 
 
 class GreetingMismatchError(LinkError):
-    """A board with another protocol version, register map or BAR size."""
+    """The board has another protocol version, register map or BAR size than this software."""
 
     exit_code = 2
 
 
 class AccessError(LinkError):
-    """An access that the board has refused.
+    """The board has refused an access.
 
     Attributes:
-        code: The board's error code, a `register_map.ErrorCode` (or an unknown number).
+        code: The board's error code: a `register_map.ErrorCode`, or an unknown number.
         detail: The board's explanation.
     """
 
@@ -110,13 +110,13 @@ class HeldError(AccessError):
 
 
 class StaleHandleError(AccessError):
-    """A handle of a board that was programmed again after the handle was opened."""
+    """The board was programmed again after the handle was opened."""
 
 
 class BoardError(PcieShimError):
-    """A board of the mini-cluster, with its number `board` from 0, that cannot be opened or on which a frame failed.
+    """A board of the mini-cluster cannot be opened, or a frame failed on it. `board` is the board's number, from 0.
 
-    `__cause__` is the LinkError or ImageError, whose exit code this error takes over.
+    `__cause__` is a LinkError or an ImageError. This error has the exit code of its cause.
     """
 
     def __init__(self, sentence: str, *, board: int, exit_code: int = 5) -> None:

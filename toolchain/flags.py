@@ -82,7 +82,7 @@ def _group(kind: Any) -> Group:
 
 
 def key_values(settings: Iterable[str], flag: str = "--set", example: str = "width=64") -> dict[str, str]:
-    """Return the values of repeated flags KEY=VALUE by key; a BuildError for a missing `=` or key, or a duplicate."""
+    """Return the values of a repeated flag KEY=VALUE by key. Raises a BuildError for an invalid or duplicate key."""
     found: dict[str, str] = {}
     for setting in settings:
         key, equals, value = setting.partition("=")
@@ -96,7 +96,7 @@ def key_values(settings: Iterable[str], flag: str = "--set", example: str = "wid
 
 
 def names_in(flag: str, text: str) -> list[str]:
-    """Return the names in `A,B,C`; a BuildError if one is empty."""
+    """Return the names in a text such as `A,B,C`. Raises a BuildError if a name is empty."""
     names = [name.strip() for name in text.split(",")] if text else []
     if not all(names):
         raise BuildError(f"{flag} {text}: expected comma-separated names, such as {flag} A,B")

@@ -19,9 +19,9 @@ TICK = 0.2
 
 
 class DeployedBoards:
-    """The boards of a deployment; a restarted board is programmed and opened again.
+    """The boards of a deployment. A restarted board is programmed and opened again.
 
-    One thread at a time may use it, except for `status`.
+    Only one thread at a time may call the methods. `status` is the exception.
     """
 
     def __init__(
@@ -32,7 +32,7 @@ class DeployedBoards:
         *,
         reprogram: bool = False,
     ) -> None:
-        """Read the images; with `reprogram`, boards with another image are programmed instead of refused."""
+        """Read the images. With `reprogram`, a board that has another image is programmed; otherwise it is refused."""
         self._settings = settings
         self.deployment = deployment
         self._images = images_of(deployment)
@@ -50,7 +50,7 @@ class DeployedBoards:
         self._times_gone = [0] * len(self._endpoints)
 
     def open(self) -> str:
-        """Open all boards, program blank ones, and return a sentence for the user, or raise a PcieShimError."""
+        """Open all boards and program the blank ones. Return a sentence for the user, or raise a PcieShimError."""
         self._cluster = MiniCluster.open(
             self._endpoints,
             self._images,
@@ -90,16 +90,16 @@ class DeployedBoards:
             raise
 
     def post(self, frame: FrameRequest) -> None:
-        """Start a frame; `collect` returns its result. After a BoardError, call `find_lost_boards`."""
+        """Start a frame, whose result `collect` returns. If this call raises a BoardError, call `find_lost_boards`."""
         self._whole_cluster().post(self._input(frame))
 
     def collect(self) -> FrameOutput | None:
-        """Return the posted frame's result, or None while boards run; after a BoardError, call `find_lost_boards`."""
+        """Return the posted frame's result, or None while boards run. On a BoardError, call `find_lost_boards`."""
         return self._whole_cluster().collect(0)
 
     @property
     def awaited(self) -> int | None:
-        """File descriptor that is readable when `collect` has something to read; None if no board is awaited."""
+        """File descriptor that becomes readable when `collect` has data to read, or None if no board is awaited."""
         return None if self._cluster is None else self._cluster.awaited
 
     @property
@@ -117,7 +117,7 @@ class DeployedBoards:
         return driver_input(self.deployment, frame, self._settings.stop or self.deployment.machine.stop)
 
     def find_lost_boards(self, error: BoardError) -> None:
-        """Find all boards that are gone after a failure, so that boards that die together fail only one frame."""
+        """After a failure, find all boards that are gone. So boards that fail together cost only one frame."""
         # a BoardAwayError is about a board that is already known to be gone
         if self._cluster is None or isinstance(error, BoardAwayError):
             return

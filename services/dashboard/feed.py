@@ -54,7 +54,7 @@ class KeptFrame:
 
     @property
     def form(self) -> object:
-        """Labels and shape of the posterior, or False without one. Posteriors of the same variables have equal forms."""
+        """The labels and shape that posteriors of the same variables share, or False if there is no posterior."""
         return self.values is not None and (self.labels, self.values.shape)
 
     def sampling_error(self, probabilities: "NDArray[np.float64]") -> "NDArray[np.float64] | None":
@@ -158,7 +158,7 @@ class Feed:
         return frame
 
     def add_loss(self, reason: str) -> None:
-        """Count a frame without a posterior under its reason. After `_MAX_REASONS` reasons, new ones count as `OTHER`."""
+        """Count a frame without a posterior by its reason. After `_MAX_REASONS` reasons, new ones count as `OTHER`."""
         known = reason in self.lost or len(self.lost) < _MAX_REASONS
         self.lost[reason if known else OTHER] += 1
 

@@ -25,7 +25,7 @@ from toolchain.models.inference import eliminate, product
 from toolchain.models.network import NetworkModel
 
 MOST_BITS: Final = 9
-"""Maximum number of unknown bits: the matrix of a sweep has 2**bits rows and columns."""
+"""Maximum number of unknown bits. With n unknown bits, the matrix of a sweep has 2**n rows and columns."""
 _MOST_READINGS: Final = 64
 _WORK: Final = 2**27
 """Maximum number of readings times multiplications of one matrix product, so that all take a few seconds."""
@@ -34,9 +34,9 @@ _WORK: Final = 2**27
 def agreement(
     machine: BM2Machine, bit: int, values: Mapping[int, NDArray[np.int64]]
 ) -> list[tuple[int, NDArray[np.float64]]]:
-    """Return the CDEs whose factors contain a bit, each with its chance of drawing a 1 in each state, float64[states].
+    """Return each CDE whose factor contains a bit, and the CDE's chance of drawing 1 in each state, float64[states].
 
-    `values` has the value of every other bit of these factors in each state, int64[states], by bit.
+    `values` maps every other bit of these factors to the bit's value in each state, int64[states].
     """
     p, found = machine.parameters, []
     variable = next(at for at, mask in enumerate(p.masks) if mask >> bit & 1)
@@ -51,9 +51,9 @@ def agreement(
 
 
 class ExactChain:
-    """The chain over the states of the unknown bits; bit i of a state's index is the i-th unknown bit.
+    """The Markov chain over the states of the unknown bits. Bit i of a state's index is the i-th unknown bit.
 
-    `evidence` has the value of each known variable, by index; at most `MOST_BITS` bits may be left unknown.
+    `evidence` maps the index of each known variable to its value. At most `MOST_BITS` bits may be left unknown.
     """
 
     def __init__(self, machine: BM2Machine, evidence: Mapping[int, int]) -> None:
@@ -113,8 +113,8 @@ class ExactChain:
     def law(self) -> NDArray[np.float64]:
         """float64[states]: the stationary law after a sweep.
 
-        The elimination of Grassmann, Taksar and Heyman subtracts nothing, so it is exact even where clipped codes make
-        some states nearly inescapable.
+        It is computed by the elimination of Grassmann, Taksar and Heyman. This method subtracts nothing, so it is exact
+        even where clipped codes make some states nearly inescapable.
         """
         left = self.sweep.copy()
         for n in range(len(left) - 1, 0, -1):
@@ -144,7 +144,7 @@ class ExactChain:
         return searched_values(self._parameters, words)
 
     def posterior(self, law: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the posterior over the searched variables' joint values, float64[values], for a law of states."""
+        """Return the posterior of the searched variables' joint values, float64[values], for a law of the states."""
         p, used = self._parameters, self._searched >= 0
         size = int(np.prod([p.cardinalities[variable] for variable in p.searched]))
         found = np.bincount(self._searched[used], law[used], size)
@@ -156,7 +156,7 @@ class ExactChain:
         return np.asarray(np.linalg.inv(np.eye(len(self.law)) - self.sweep + self.law))
 
     def effective(self) -> NDArray[np.float64]:
-        """Return how many independent samples a sweep is worth, for each searched value: float64[values]."""
+        """Return the number of independent samples that equal one sweep, for each searched value: float64[values]."""
         places = np.arange(len(self.posterior(self.law)))
         values = (self._searched[:, np.newaxis] == places).astype(np.float64)
         centred = values - self.law @ values
@@ -165,9 +165,9 @@ class ExactChain:
         return np.asarray(np.divide(own, total, out=np.ones_like(own), where=own > 0))
 
     def frame(self, state: int, burn_in: int, sweeps: int) -> NDArray[np.float64]:
-        """Return the distribution of the state, averaged over a frame's sweeps after its burn-in: float64[states].
+        """Return the mean distribution of the state over the sweeps of a frame after the burn-in: float64[states].
 
-        `state` is the start state of all variables, bit i for bit i of the machine.
+        `state` is the start state of all variables. Bit i of `state` is bit i of the machine.
         """
         first = np.linalg.matrix_power(self.sweep, burn_in + 1)[
             sum((state >> bit & 1) << at for at, bit in enumerate(self._unknown))
@@ -178,38 +178,38 @@ class ExactChain:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChainError:
-    """The expected error of a frame, averaged over readings, and computed without a run.
+    """The expected error of a frame, averaged over readings, and computed without running the machine.
 
-    Distances are total variations of the searched variables' posterior.
+    Distances are total variation distances between posteriors of the searched variables.
     """
 
     share: float
-    """The total probability of the readings that were examined, which are the likeliest ones."""
+    """The total probability of the examined readings. The most probable readings are examined."""
     quantising: float
-    """Mean distance of the stationary law from exact inference, over the readings."""
+    """Mean distance of the stationary law's posterior from exact inference, over the examined readings."""
     worst: float
-    """Largest distance of the stationary law from exact inference, over the readings."""
+    """Largest distance of the stationary law's posterior from exact inference, over the examined readings."""
     worst_reading: tuple[int, ...]
-    """The reading with the largest distance (`worst`): an address per known variable."""
+    """The reading with the distance `worst`: one address per known variable."""
     start: float
-    """Mean distance of a frame's mean law from the stationary law: the effect that the start has after burn-in."""
+    """Mean distance of a frame's expected posterior from the stationary law's: the start's effect after burn-in."""
     sampling: float
-    """Mean distance of a frame's posterior from its expected value, because samples are finite and correlated."""
+    """Mean distance of a frame's posterior from its expected value, because the samples are few and correlated."""
     cycles: float
     """Mean cycles of a sweep."""
     effective: float
-    """Effective samples per sweep, for the reading and the searched value that mix most slowly."""
+    """Minimum of the effective samples per sweep, over all examined readings and searched values."""
 
 
 def distance(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> float:
-    """Return the total variation of two distributions, 0 to 1."""
+    """Return the total variation distance between two distributions, from 0 to 1."""
     return float(np.abs(ours - theirs).sum() / 2)
 
 
 def chain_error(machine: BM2Machine, model: NetworkModel, *, samples: int) -> ChainError | None:
-    """Return the expected error of a frame with readings of all known variables; None if the chain is too large.
+    """Return the expected error of a frame with readings of all known variables, or None if the chain is too large.
 
-    `machine` must have been built from `model`. All boards are taken to start in the same state.
+    `machine` must have been built from `model`. The result assumes that all boards start in the same state.
     """
     p = machine.parameters
     unknown = p.state_bits - sum(p.bits[variable] for variable in p.known)

@@ -169,7 +169,7 @@ class Logic:
 
 
 def state_bits(p: BM1Parameters | BM2Parameters, table_length: int) -> int:
-    """Return the width of a generator's state, in bits. The state is an LFSR, or an index in the random numbers' table."""
+    """Return the width of a generator's state in bits. The state is an LFSR, or an index in a table of numbers."""
     return p.rng.lfsr_bits or _index_bits(table_length)
 
 
@@ -321,7 +321,7 @@ def word_memories_of(p: BM1Parameters, inputs: int = 0) -> list[EqualMemories]:
 def place_memories(
     parameters: BM1Parameters, device: Device, table_length: int = LENGTH, inputs: int = 0
 ) -> Memories:
-    """Place tables in the M20Ks that other memories leave free, the deepest first. Memory LABs hold the other tables."""
+    """Place tables in the M20Ks that other memories leave free, the deepest first. The rest are in memory LABs."""
     tables = tables_of(parameters)
     room = math.floor(device.usable * device.blocks)
     others = random_memories_of(parameters, table_length) + word_memories_of(parameters, inputs)

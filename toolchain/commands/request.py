@@ -170,7 +170,7 @@ def _case_source(path: Path, flags: ModelFlags, settings: dict[str, str]) -> "Mo
 def build_options(
     flags: BuildFlags, target: TargetOptions, sources: Path | None = None, *, is_checked: bool = False
 ) -> BuildOptions:
-    """Return the options of a build. If there are several topics, they stand in the file `sources` and not in the flags.
+    """Return the options of a build. Several topics stand in the file `sources` and not in the flags.
 
     With `is_checked`, the flags that name the topic of the readings may be missing.
     """
@@ -210,7 +210,7 @@ def build_options(
 
 
 def fit_to_device(plan: "MachinePlan", name: str | None) -> tuple["MachinePlan", str]:
-    """Return the plan with enough boards of the device, and the reasons. With `--replicas fill`, the boards are full."""
+    """Return the plan with enough boards of the device, and the reasons. `--replicas fill` makes each board full."""
     if name is None:
         return plan, ""
     from toolchain.analysis.logic import device_named

@@ -133,7 +133,7 @@ class DeploymentFile(Section):
 
 
 class Deployment(DeploymentFile):
-    """A deployment in its folder, ready for the services."""
+    """The content of `deployment.toml` together with its folder, as the services use them."""
 
     directory: Path = Field(default=Path(), exclude=True)
 
@@ -148,7 +148,7 @@ class Deployment(DeploymentFile):
         return next((variable for variable in self.variables if variable.kind == "prior_select"), None)
 
     def machine_addresses(self, addresses: Iterable[int | None]) -> tuple[tuple[int | None, ...], int]:
-        """Split the addresses of all variables into those of the columns (None: missing) and the row of the prior."""
+        """Split the addresses of all variables into the columns' addresses (None: missing) and the prior's row."""
         sensors: list[int | None] = []
         row = 0
         for variable, address in zip(self.variables, addresses, strict=True):
@@ -169,14 +169,14 @@ class Deployment(DeploymentFile):
 
     @property
     def result_dimensions(self) -> tuple[Dimension, ...]:
-        """The dimensions of a published result: replicas if there are several, then the searched dimensions."""
+        """The dimensions of a published result. If there are several replicas, their dimension comes first."""
         replicas = self.machine.replicas
         if replicas == 1:
             return tuple(self.searched)
         return (Dimension(label=REPLICA, size=replicas), *self.searched)
 
     def reading_shape(self, variable: Variable) -> tuple[int, ...]:
-        """Shape of a variable's reading: () for one number, (lines,), (replicas,), or (replicas, lines)."""
+        """Return the shape of a variable's reading: () for a number, (lines,), (replicas,) or (replicas, lines)."""
         machine = self.machine
         per_line = machine.reads_lines and variable.kind == "sensor"
         replicas = () if machine.replicas == 1 else (machine.replicas,)
@@ -192,7 +192,7 @@ class Deployment(DeploymentFile):
         return self.directory / self.boards[board].image
 
     def new_filter(self) -> "Filter | None":
-        """Return a new filter from the file of `[filter]`, or raise a DeploymentError; None without this section."""
+        """Return a new filter from the file in `[filter]`, or None without this section. May raise a DeploymentError."""
         if self.filter is None:
             return None
         # here, because a subscriber loads a deployment without NumPy
@@ -203,11 +203,11 @@ class Deployment(DeploymentFile):
 
     @property
     def edited_boards(self) -> tuple[int, ...]:
-        """The boards whose images come from MIFs or parameters edited by hand, and may differ from the model."""
+        """The boards whose images come from MIFs or parameters edited by hand. They may differ from the model."""
         return tuple(index for index, board in enumerate(self.boards) if board.built_hash)
 
     def output_uri(self, output: Output) -> str:
-        """Return the rosbridge server on which an output is published."""
+        """Return the URI of the rosbridge server on which an output is published."""
         return output.uri or self.sources[0].uri
 
 
@@ -233,7 +233,7 @@ def deployment_hash(deployment: DeploymentFile) -> str:
 
 
 def with_hash(deployment: Deployment) -> Deployment:
-    """Return a deployment with the hash of its content."""
+    """Return a copy of a deployment, in which `hash` is the hash of the content."""
     return deployment.replace(hash=deployment_hash(deployment))
 
 
@@ -291,7 +291,7 @@ def load_deployment(
 
 
 def other_image(path: Path, found: str, named: str) -> DamagedDeploymentError:
-    """Return the error for an image whose hash is `found`, while `deployment.toml` has `named`."""
+    """Return the error for an image with the hash `found`, where `deployment.toml` has the hash `named`."""
     return DamagedDeploymentError(
         f"{path} is another board's or another build's image: its hash is {found[:16]}, {FILE_NAME} names {named[:16]}; "
         "if 'toolchain regenerate' was interrupted, run it again, otherwise build again with 'toolchain build'"
@@ -326,7 +326,7 @@ _TOML_HEADER: Final = """\
 
 
 def deployment_text(deployment: DeploymentFile) -> str:
-    """Return the text of `deployment.toml`: the same deployment gives the same bytes."""
+    """Return the text of `deployment.toml`. Equal deployments give the same bytes."""
     content: dict[str, Any] = deployment.model_dump(mode="json", exclude_none=True)
     aliases = {name: field.validation_alias for name, field in type(deployment).model_fields.items()}
     plain = {key: value for key, value in content.items() if not isinstance(value, list | dict)}
