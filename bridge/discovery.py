@@ -1,10 +1,10 @@
 """Discovery of rosbridge servers on the local network by multicast DNS, as in Bonjour and Avahi.
 
 A server announces itself as an instance of the service `_rosbridge._tcp.local.`, under the name of the robot.
-The properties of the service are `path` of the URL, `tls`, `token` and `ros` (1 or 2). All properties are optional, so
-a line in the configuration of Avahi is sufficient to announce a rosbridge server.
+The service has the properties `path` of the URL, `tls`, `token` and `ros` (1 or 2). All of them are optional, so a
+line in the configuration of Avahi is sufficient to announce a rosbridge server.
 
-The package `zeroconf` is optional (`pip install zeroconf`). The functions of this module import it when called.
+The functions import the optional package `zeroconf` (`pip install zeroconf`) when they are called.
 Data from the network is not trusted: its amount is limited, and announcements with unprintable names are ignored.
 
 Source: RFC 6762 and 6763.

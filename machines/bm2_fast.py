@@ -296,7 +296,7 @@ less_in_chunk: Final = in_llvm(types.uint64, None, types.int64, types.uint16)(co
 
 @jit
 def fill(wiring: Wiring, numbers: npt.NDArray[np.uint16], generators: Words, ones: int) -> None:
-    """Compute the first block of a chain's random numbers, and write the block to `numbers`."""
+    """Write the first block of a chain's random numbers to `numbers`."""
     exponents = wiring.exponents
     for cde in range(generators.shape[0]):
         state = generators[cde]
@@ -333,7 +333,7 @@ def refill(exponents: Integers, numbers: npt.NDArray[np.uint16], first: int, row
 def run_chain(  # noqa: PLR0915 - a call of a function takes longer than a move
     wiring: Wiring, moves: Moves, chain: Chain, settings: Integers
 ) -> None:
-    """Run a chain until it stops, and write the reason to `chain.control`."""
+    """Run a chain until it stops. The reason is in `chain.control`."""
     ops_timeout, samples_due, pause_at = settings[OPS_TIMEOUT], settings[SAMPLES_DUE], settings[PAUSE_AT]
     max_cycles, stream, room = settings[LIMIT], settings[STREAM], chain.stream.shape[0]
     random, every_move = settings[RANDOM], settings[EVERY_MOVE]

@@ -28,7 +28,7 @@ _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 
 def jit(function: _Function) -> _Function:
-    """Compile a function at its first call. If numba's cache folder is writable, the compiled code is cached there."""
+    """Compile a function at its first call, and cache it on disk if numba's cache folder is writable."""
     try:
         return cast("_Function", njit(cache=True, nogil=True)(function))
     except RuntimeError:  # no writable folder: every process compiles
@@ -130,8 +130,8 @@ def make_frame(parameters: BM1Parameters, rows: int) -> _Frame:
 def bit_tables(kind: RngKind, steps_per_clock: int, prob_bits: int) -> Words:
     """Return tables that map an LFSR's state to its output bits in the next block of cycles.
 
-    The shape is uint64[prob_bits, bits / 4, 16, BLOCK_WORDS]. Each table is for 4 bits of the state. The tables are
-    smaller than those of `machines.rng.map_tables`, so that all tables fit into the processor's first caches.
+    The shape is uint64[prob_bits, bits / 4, 16, BLOCK_WORDS]. Each table is for 4 bits of the state, so that all
+    tables fit into the processor's first caches.
     """
     clock = jump_tables(kind, steps_per_clock)[0]
     bits = LFSR(kind).bits

@@ -57,10 +57,7 @@ class FrameInput:
 
 
 class FrameSettings(NamedTuple):
-    """Values of the registers that a host writes to start or resume a frame, in the order of the register map.
-
-    Every kind of machine has these registers.
-    """
+    """The registers that start or resume a frame, in the order of the map. Every kind of machine has the registers."""
 
     target_count: int
     max_cycles: int
@@ -171,7 +168,7 @@ class BoardMachine(ABC):
 
     @abstractmethod
     def reset(self) -> None:
-        """Stop the machine, clear its results and cycles, and restart its RNGs from bank 0 of the seeds."""
+        """Stop the machine, clear its results and cycles, and restart its RNGs from bank 0."""
 
     @abstractmethod
     def start(self, settings: FrameSettings, end: int) -> None:
@@ -314,10 +311,7 @@ class MachineKind(ABC):
 
     @abstractmethod
     def infer(self, results: Sequence[BoardResult], variables: Sequence[str] = ()) -> Inference:
-        """Return the posterior that follows from the results of all boards.
-
-        `variables` has the names of the machine's variables. They appear in messages.
-        """
+        """Return the posterior for the results of all boards. Messages use the variables' names in `variables`."""
 
     @abstractmethod
     def posterior(

@@ -30,7 +30,7 @@ from posteriors.posterior import MAX_RESULT, RESULTS_TOPIC, RESULTS_TYPE, Poster
 from terminal.health import in_thread
 
 QUEUE_SIZE: Final = 64
-"""Default maximum number of posteriors that have arrived and that the reader has not taken yet."""
+"""Default maximum number of received posteriors that wait for the reader."""
 FIRST_TIMEOUT: Final = 30.0
 """Default timeout for the first posterior, in seconds."""
 _DISORDER_NS: Final = 50_000_000

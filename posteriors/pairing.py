@@ -15,7 +15,7 @@ FrameOutcome = Posterior | FrameReport
 """The posterior of a frame, or the report of a frame without a posterior."""
 
 WAITING: Final = 256
-"""Maximum number of reports that wait for posteriors, and maximum number of posteriors that wait for reports."""
+"""Maximum number of waiting reports. It is also the maximum number of waiting posteriors."""
 
 
 class Pairing:
@@ -59,7 +59,7 @@ class Pairing:
         return ready
 
     def flush(self) -> list[FrameOutcome]:
-        """Remove and return the posteriors that still wait for reports. The reports are considered lost."""
+        """Remove and return the posteriors whose reports have not arrived."""
         ended: list[FrameOutcome] = list(self._posteriors)
         self._posteriors.clear()
         return ended

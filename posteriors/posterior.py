@@ -27,9 +27,7 @@ RESULTS_TYPE: Final = "std_msgs/Float64MultiArray"
 SAMPLES_TOPIC: Final = "/bm/samples"
 SAMPLES_TYPE: Final = "std_msgs/UInt8MultiArray"
 MAX_RESULT: Final = 1 << 23
-"""Maximum size in bytes of a posterior as JSON. It has room for 64 boards of 4096 cells with 26 bytes per number,
-and for the rest of the message.
-"""
+"""Maximum size in bytes of a posterior as JSON, sufficient for 64 boards of 4096 cells with 26 bytes per number."""
 REPLICA: Final = "replica"
 """Label of the first dimension if an array contains the posteriors of several replicas."""
 
@@ -78,10 +76,7 @@ class Posterior:
         return self.sizes[0] if self.labels[0] == REPLICA else 1
 
     def replica(self, at: int) -> "Posterior":
-        """Return the posterior of replica `at`, without the label `replica`.
-
-        Raises a LabelError if the replica does not exist, or has no posterior in this frame.
-        """
+        """Return the posterior of replica `at` without the label `replica`. Raises a LabelError if it has no posterior."""
         if not 0 <= at < self.replicas:
             raise LabelError(f"there is no replica {at}: expected 0 to {self.replicas - 1}")
         if self.labels[0] != REPLICA:

@@ -116,8 +116,8 @@ def grid_message(
 ) -> dict[str, Any]:
     """Return a posterior as a nav_msgs/OccupancyGrid. The cells of `plane` must be square.
 
-    A cell of probability p has the value `round(98 p / p_max)`, at index `y * width + x`. If an axis has a negative
-    step, the grid reverses this axis, because x and y increase with the index.
+    A cell of probability p has the value `round(98 p / p_max)`, at index `y * width + x`. An axis
+    with a negative step is reversed, because x and y increase with the index.
     """
     cells = plane.cells(posterior)[:: -1 if plane.y.step < 0 else 1, :: -1 if plane.x.step < 0 else 1]
     data = np.rint(cells * (MOST_OCCUPIED / posterior.max())).astype(np.int8)
@@ -197,8 +197,7 @@ def decision_statuses(
 ) -> list[dict[str, Any]]:
     """Return a DiagnosticStatus for each replica, with the replica's most probable value.
 
-    `why` says why the decision is not valid. For a valid decision, it is empty. `age_ms` is the time since the
-    receipt of the reading.
+    `why` says why the decision is not valid, or is empty. `age_ms` is the time since the receipt of the reading.
     """
     replicas = deployment.machine.replicas
     rows = [None] * replicas if posterior is None else posterior.reshape(replicas, -1)

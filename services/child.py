@@ -120,10 +120,7 @@ class Child:
         directory: LockedRunDirectory | None = None,
         ends: deque[float] | None = None,
     ) -> None:
-        """Store the command. `ends` keeps the times of the last exits, and several children may share it.
-
-        The maximum length of `ends` is the number of permitted restarts plus 1.
-        """
+        """Store the command. `ends` keeps at most `RESTARTS` + 1 exit times by default. Several children may share it."""
         self.name = name
         self._command = command
         # The run directory, whose lock the child holds too, so that the next run waits for its end.

@@ -5,8 +5,8 @@
     logging of libraries ──────────────────┤
     relayed lines of children ─────────────┘
 
-The environment variable `BM_LOG_FORMAT` selects the format, also for child processes. Text from a peer is escaped, so
-that the text can neither begin a line nor control a terminal.
+`BM_LOG_FORMAT` selects the format, also for child processes. Text from a peer is escaped, so that it can neither begin
+a line nor control a terminal.
 """
 
 import json
@@ -47,7 +47,7 @@ class LogFormat(StrEnum):
 
 
 def log_format() -> LogFormat:
-    """Return the current log format, or `TEXT` if the environment variable is invalid. The settings report the error."""
+    """Return the log format, or `TEXT` if the environment variable is invalid. The settings report the error."""
     value = os.environ.get(FORMAT_VARIABLE, "")
     return LogFormat(value) if value in set(LogFormat) else LogFormat.TEXT
 

@@ -22,10 +22,7 @@ def lines_of(text: str) -> str:
 
 
 def shown(value: object) -> str:
-    """Return a value as text for a sentence, cut to 80 characters.
-
-    If the text is empty, not printable, or has a space at an end, the text is quoted.
-    """
+    """Return a value as text, cut to 80 characters. Empty or unprintable text, or text with outer spaces, is quoted."""
     text = str(value)
     text = text if text.isprintable() and text and text.strip() == text else repr(text)
     return text if len(text) <= _LONGEST else text[:_LONGEST] + "..."

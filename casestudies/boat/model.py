@@ -1,7 +1,6 @@
 """The boat's model: P(distance | cell) and P(bearing | cell) for three beacons (thesis 2.1.2.1, 4.2).
 
-The columns are in the order D1, D2, D3, B1, B2, B3. The cell (x, y), counted from the lower left corner, is
-line y * width + x.
+The columns are in the order D1, D2, D3, B1, B2, B3. Lines start at the lower left corner: line = y * width + x.
 """
 
 from typing import Literal

@@ -26,7 +26,7 @@ def mornings(seed: int) -> Iterator[tuple[int, int, int]]:
 
 
 async def publish_mornings(uri: str, *, seed: int, rate: float, count: int | None = None) -> None:
-    """Publish whether the grass is wet, for `count` mornings. If `count` is None, publish until cancelled.
+    """Publish whether the grass is wet, for `count` mornings, or until cancelled if `count` is None.
 
     Raises a BridgeError if no server answers at the URI.
     """

@@ -33,7 +33,7 @@ class _Server(uvicorn.Server):
 
 
 class PageServer:
-    """The web server of the dashboard's page. It accepts connections on a socket that is already listening.
+    """The web server of the dashboard's page, on a listening socket.
 
     Attributes:
         ready: Event that is set when browsers can open the page.

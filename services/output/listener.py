@@ -32,7 +32,7 @@ async def show_frames(
 ) -> int:
     """Show and save frames until `count` posteriors have arrived. If `count` is None, continue without end.
 
-    After the first frame, at most `silence` seconds may pass between two frames. None stands for no limit.
+    After the first frame, at most `silence` seconds may pass between two frames. None means no limit.
 
     Raises:
         NoResultError: No frame arrived in time.

@@ -180,7 +180,7 @@ class StackStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def connections(rosbridges: Mapping[str, Ros]) -> list[ConnectionStatus]:
-    """Return the state of each connection to a rosbridge server. `rosbridges` has the clients by the server's URI."""
+    """Return the state of each rosbridge connection. The keys of `rosbridges` are the URIs of the servers."""
     return [ConnectionStatus(uri, str(ros.state), ros.reconnections) for uri, ros in rosbridges.items()]
 
 
@@ -207,7 +207,7 @@ _BACKLOG_EVERY = 0.01
 async def read_process_status(path: str, timeout: float) -> ProcessStatus:
     """Return the status that a process reports at its status socket.
 
-    Raises a NoHealthError if no valid status arrives within `timeout` seconds. The function does not use a thread,
+    Raises a NoHealthError if no valid status arrives within `timeout` seconds. The function uses no thread,
     because Python waits for ever for a thread that cannot start for lack of memory.
     """
     data = bytearray()

@@ -67,7 +67,7 @@ class Answer:
         return [int(each.argmax()) for each in (self.exact, ours) if each is not None]
 
     def as_json(self) -> str:
-        """Return the answer as a line of JSON. Its list `posterior` has an object for each combination of states."""
+        """Return the answer as a line of JSON. Its `posterior` has an object for each combination of states."""
         names = [each.name for each in self.searched]
         ours = self.machine.posterior if self.machine else None
         rows: list[dict[str, Any]] = [

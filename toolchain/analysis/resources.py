@@ -51,7 +51,7 @@ class Estimate:
 
     @property
     def fits(self) -> bool:
-        """True if the usable resources of the device are sufficient for the machine."""
+        """True if the device has enough usable resources."""
         return self.why_not == ""
 
     @property

@@ -41,7 +41,7 @@ def model_for(
 
 
 def network_for(source: Model | Question) -> NetworkModel:
-    """Return a model or a question as a Bayesian network. Raises a ModelError if there is no such network."""
+    """Return a model or a question as a network. Raises a ModelError if there is no such network."""
     return source.network() if isinstance(source, Question) else network_of(source)
 
 

@@ -73,7 +73,7 @@ class Support:
     median: float
     """Median number of the variable's readings per line, over the lines with at least one reading."""
     refused: int
-    """Number of readings that were not used, because they are not values of the variable."""
+    """Number of readings that are not values of the variable."""
 
 
 def locate(model: Model, columns: Mapping[str, Sequence[object]], rows: int) -> TrueCells:
@@ -182,9 +182,9 @@ def mixture(
 ) -> tuple[float, float, list[float]]:
     """Fit one normal to all variables together, and a share of outliers to each variable.
 
-    For each variable, `residuals` has the differences between readings and expected readings. `widths` has the widths
-    of the variables' ranges. Outliers are uniform over the range. If `bias` is False, the normal's mean is 0. Returns
-    the normal's mean, its standard deviation, and the shares.
+    `residuals` has each variable's readings minus their expected values. Outliers are uniform over the variable's
+    range; `widths` has the ranges' widths. If `bias` is False, the normal's mean is 0. Returns the normal's mean, its
+    standard deviation, and the shares.
     """
     everything = np.concatenate(residuals)
     mean = float(np.median(everything)) if bias else 0.0
