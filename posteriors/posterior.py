@@ -76,7 +76,7 @@ class Posterior:
         return self.sizes[0] if self.labels[0] == REPLICA else 1
 
     def replica(self, at: int) -> "Posterior":
-        """Return the posterior of replica `at` without the label `replica`. Raises a LabelError if it has no posterior."""
+        """Return the posterior of replica `at`, without the label `replica`. Raises a LabelError if none exists."""
         if not 0 <= at < self.replicas:
             raise LabelError(f"there is no replica {at}: expected 0 to {self.replicas - 1}")
         if self.labels[0] != REPLICA:

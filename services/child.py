@@ -120,7 +120,7 @@ class Child:
         directory: LockedRunDirectory | None = None,
         ends: deque[float] | None = None,
     ) -> None:
-        """Store the command. `ends` keeps at most `RESTARTS` + 1 exit times by default. Several children may share it."""
+        """Store the command. `ends` keeps the last exit times (`RESTARTS` + 1 by default). Children may share it."""
         self.name = name
         self._command = command
         # The run directory, whose lock the child holds too, so that the next run waits for its end.
