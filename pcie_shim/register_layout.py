@@ -47,5 +47,5 @@ def register_values(fields: Mapping[str, int]) -> dict[int, int]:
 
 
 def interface_room(registers: UsedRegisters) -> tuple[int, int]:
-    """Return the numbers of words in the map for inputs (block `registers.inputs`) and for results."""
+    """Return how many words the register map has for inputs (block `registers.inputs`) and for results."""
     return rm.BLOCKS[registers.inputs].words, rm.RESULTS.words

@@ -1,4 +1,4 @@
-"""Checks of the data that a client sends. A check compares data with the definition of their ROS type.
+"""Checks of the data that a client sends. A check compares data with the definition of the data's ROS type.
 
 rosapi, a node beside most rosbridge servers, sends the definitions. Its services have names below `/rosapi`.
 """
@@ -91,7 +91,7 @@ class TypeChecks:
             _apply(check, goal, f"a goal of {action}")
 
     async def part(self, part: _Part, type_name: str, limit: float = _ROSAPI_TIMEOUT) -> MessageCheck | None:
-        """Return the check of a request, answer, goal, result or feedback, or None if its type is unknown."""
+        """Return the check of a request, answer, goal, result or feedback, or None if the type is unknown."""
         async with self._asking:
             key = part, type_name
             if key not in self._parts and self._may_ask():

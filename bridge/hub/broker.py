@@ -66,7 +66,7 @@ class Broker:
         rosapi = Rosapi(self.graph, self.limits, self.definitions, wall_clock)
         self._dispatcher = Dispatcher(self.limits)
         self.take_ready = self._dispatcher.take_ready
-        """Returns the clients marked as ready since the last call. Each has output, or must be closed."""
+        """Returns the clients marked as ready since the last call. Each client has output, or must be closed."""
         self._topics = Topics(self.graph, self.limits, self._dispatcher, self.definitions, self._refuse)
         self._actions = Actions(self.graph, self.limits, self._dispatcher, self.definitions)
         self._calls = Calls(

@@ -41,7 +41,7 @@ class Dispatcher:
             self._ready.append(client)
 
     def take_ready(self) -> list[Client]:
-        """Return the clients marked as ready since the last call. Each has output, or must be closed."""
+        """Return the clients marked as ready since the last call. Each client has output, or must be closed."""
         ready, self._ready = self._ready, []
         for client in ready:
             client.is_ready = False

@@ -51,7 +51,7 @@ class WebSocketTransport(asyncio.Protocol):
     slice_bytes: ClassVar[int] = sys.maxsize
 
     def __init__(self, protocol: ClientProtocol | ServerProtocol, *, max_size: int, write_limit: int) -> None:
-        """Prepare the connection for a `protocol` with the same `max_size`. `write_limit` unsent bytes set `paused`."""
+        """Prepare the connection. `protocol` must have this `max_size`. `write_limit` unsent bytes set `paused`."""
         # Monotonic seconds of the last data from the peer, whatever it was.
         self.last_heard = time.monotonic()
         # True while messages can be sent. It copies the library's state, which takes longer to look up, after each
@@ -187,7 +187,7 @@ class WebSocketTransport(asyncio.Protocol):
 
     @contextmanager
     def together(self) -> Iterator[None]:
-        """Collect the output of a `with` block, and write it at once when the block ends."""
+        """Collect the output of a `with` block, and write it in one piece when the block ends."""
         if self._held is not None:
             yield
             return

@@ -34,7 +34,7 @@ class Landmark:
 
 
 def read_landmarks(path: Path) -> tuple[Landmark, ...]:
-    """Return the landmarks of a CSV file (landmark, x_m, y_m) in order, or raise a ModelError for an invalid file."""
+    """Return the landmarks of a CSV file (landmark, x_m, y_m), in the order of its rows, or raise a ModelError."""
     columns = read_recording(Path(path), ("landmark", "x_m", "y_m")).columns
     found: dict[int, Landmark] = {}
     for row, values in enumerate(zip(*columns.values(), strict=True), start=1):

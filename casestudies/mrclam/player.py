@@ -245,7 +245,7 @@ def player(
 ) -> None:
     """Play a recorded robot's sightings of landmarks, and compare each posterior's mean with the reference.
 
-    Each frame is published after the result of the previous one.
+    Each frame is published after the result of the previous frame.
     """
     if print_msg:
         print(SIGHTINGS_MSG, end="")

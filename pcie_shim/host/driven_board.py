@@ -191,12 +191,12 @@ class DrivenBoard:
     # ---- a frame --------------------------------------------------------------------------------------
 
     def start(self, settings: FrameSettings, blocks: Blocks, end: int) -> None:
-        """Start a new frame: write the changed blocks and settings, and ring the doorbell (figure 3.3)."""
+        """Start a frame up to cycle `end`: write changed blocks and settings, and ring the doorbell (figure 3.3)."""
         self.waiting = True  # from here on, abandoning the frame must interrupt the board
         self._ring(settings, blocks, _START, end)
 
     def resume(self, settings: FrameSettings, blocks: Blocks, end: int) -> None:
-        """Start the frame's next slice: write the changed blocks and settings, and ring the doorbell."""
+        """Continue the frame up to cycle `end`: write changed blocks and settings, and ring the doorbell."""
         self._ring(settings, blocks, _RESUME, end, 0)
 
     def _changed(self, blocks: Blocks) -> list[RegisterWrite]:

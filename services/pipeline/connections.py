@@ -1,7 +1,7 @@
 """Connections to a deployment's rosbridge servers, and checks of the deployment's topics at the servers.
 
-`connect_all` connects to each server once. If a server has rosapi, it can say whether a topic of readings has a
-publisher, and whether results can be received.
+`connect_all` connects to each server once. Only a server with rosapi can say whether a topic of readings has
+a publisher, and whether results can be received.
 """
 
 import asyncio
@@ -125,7 +125,7 @@ class AdvertisedTopic:
 
 
 def reported_refusals(topics: Iterable[AdvertisedTopic]) -> dict[str, str]:
-    """Return, by topic name, the reasons why servers refused topics, according to their status messages."""
+    """Return, by topic name, the reasons that servers gave in status messages for refusing topics."""
     return {
         topic.name: f"{topic.name} cannot be received at {topic.uri}: {shown(status.text[:200])}; {_way_out(topic)}"
         for topic in topics

@@ -1,4 +1,4 @@
-"""The `subscriber` that runs without a master: it prints variables or addresses."""
+"""The `subscriber` that runs without a master: it prints variables, or addresses for `pcie-app`."""
 
 import asyncio
 import contextlib

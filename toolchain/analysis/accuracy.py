@@ -110,7 +110,7 @@ class ZScores:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cycles:
-    """Statistics of the cycles of the board that runs longest in a frame, over frames and banks of seeds."""
+    """Statistics over frames and banks of seeds. The cycles of a frame are those of the board that runs longest."""
 
     median: Interval
     percentile_95: Interval
@@ -118,7 +118,7 @@ class Cycles:
 
     @classmethod
     def of(cls, lengths: NDArray[np.float64]) -> Self:
-        """Return the statistics of numbers of cycles, float64[frames] or float64[frames, banks]."""
+        """Return the statistics of the frames' cycles, float64[frames] or float64[frames, banks]."""
         return cls(
             median=bootstrap(lengths, np.median),
             percentile_95=bootstrap(lengths, lambda a, **k: np.quantile(a, 0.95, **k)),

@@ -25,7 +25,7 @@ _RANDOM_SIGMAS: Final = 5
 
 
 def generator_findings(machine: CheckedMachine) -> Iterator[Finding]:
-    """Find random numbers that repeat or share bits, and columns with related random numbers."""
+    """Find random numbers that repeat or share bits between cycles, and columns with related random numbers."""
     parameters = machine.parameters
     if parameters.rng is RngKind.IDEAL:
         what = "these generators exist only in emulation, so there is no hardware project"

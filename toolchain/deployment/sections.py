@@ -128,7 +128,7 @@ Choice = Annotated[Item, Field(strict=False)]
 Unit = Annotated[
     str, Field(max_length=NAME_MAX, exclude_if=lambda unit: not unit), AfterValidator(_printable)
 ]
-"""A unit such as m. An empty unit is omitted from the file."""
+"""A unit such as m. An empty unit is omitted from `deployment.toml`."""
 # empty states are omitted from the file and from its hash
 States = Annotated[tuple[Name, ...], Field(strict=False, exclude_if=lambda states: not states)]
 
@@ -162,7 +162,7 @@ class Stop(StrEnum):
 
 
 class Queue(StrEnum):
-    """The readings that wait if readings arrive faster than the boards compute frames."""
+    """The rule for readings that wait, because they arrive faster than the boards compute frames."""
 
     LATEST = "latest"
     """Only the newest reading waits. Replaced readings are counted."""

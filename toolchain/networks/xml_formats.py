@@ -29,7 +29,7 @@ class XmlLine:
     number: int
 
     def error(self, sentence: str) -> NetworkFileError:
-        """Return an error that names the file and the line, and then contains `sentence`."""
+        """Return an error with the file, the line and `sentence`."""
         return NetworkFileError(sentence, path=self.path, line=self.number)
 
 

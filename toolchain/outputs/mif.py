@@ -46,7 +46,7 @@ class Mif:
     width: int
     """Number of bits of a word."""
     words: tuple[int, ...]
-    """All words, from address 0. If the file omits an address, its word is 0, as in Quartus."""
+    """All words, from address 0. A word at an omitted address is 0, as in Quartus."""
 
 
 def mif_lines(width: int, depth: int, words: Iterable[int], comments: Iterable[str] = ()) -> Iterator[str]:

@@ -122,7 +122,7 @@ class Publications:
             advertised.unchecked = set(advertised.holders)
 
     def publish(self, advertisement: int, msg: Mapping[str, Any]) -> bytes:
-        """Check and encode a message of an advertised topic. The caller sends the returned bytes without the outbox."""
+        """Check and encode a message of an advertised topic. The caller must send the returned bytes."""
         advertised = self._advertisements[advertisement]
         prefix = advertised.prefix
         try:
