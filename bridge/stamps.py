@@ -10,10 +10,7 @@ _KEYS: Final = (("sec", "nanosec", 2), ("secs", "nsecs", 1))
 
 
 def stamp(time_ns: int, ros_version: Literal[1, 2] | None = None) -> dict[str, int]:
-    """Return a time in nanoseconds since 1970 as a ROS time with the keys of one ROS version.
-
-    If `ros_version` is None, the time has the keys of both versions.
-    """
+    """Return nanoseconds since 1970 as a ROS time with the keys of one version, or of both if `ros_version` is None."""
     seconds, nanoseconds = divmod(time_ns, _NS)
     time: dict[str, int] = {}
     for second, nanosecond, version in _KEYS:
@@ -52,10 +49,7 @@ def header_stamp_ns(msg: Mapping[str, Any]) -> int | None:
 
 
 def ros_version_of_message(msg: Mapping[str, Any]) -> Literal[1, 2] | None:
-    """Return the ROS version that the keys of a message's `header.stamp` show.
-
-    Returns None if the stamp is missing, or if it has the keys of both versions.
-    """
+    """Return the ROS version that the keys of `header.stamp` show, or None if the keys are missing or ambiguous."""
     head = msg.get("header")
     time = head.get("stamp") if isinstance(head, Mapping) else None
     if not isinstance(time, Mapping) or ("sec" in time) == ("secs" in time):

@@ -219,10 +219,7 @@ def checked_codes(
 
 
 def checked_rng_table(given: npt.NDArray[np.uint32] | None, rng: RngKind) -> npt.NDArray[np.uint32] | None:
-    """Return `given` as a read-only uint32 array, or None if `rng` is not `TABLE`.
-
-    Raises a ParameterError if the table is missing, superfluous or invalid.
-    """
+    """Return `given` as a read-only uint32 array, or None. Raises a ParameterError if `given` does not suit `rng`."""
     if rng is not RngKind.TABLE:
         if given is not None:
             raise ParameterError(f"There is a table of random numbers, but rng = {rng} does not use one.")

@@ -20,10 +20,7 @@ from pydantic import BaseModel
 
 @dataclass(frozen=True, slots=True)
 class Flag:
-    """Names of a flag, the word for its value, and the text of its default.
-
-    If `names` is empty, the name is `--` and the name of the field.
-    """
+    """A flag's names (if not `--field-name`), the word for its value, and the text of its default."""
 
     names: tuple[str, ...] = ()
     metavar: str | None = None

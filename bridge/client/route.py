@@ -103,10 +103,7 @@ def _tls(uri: WebSocketURI, ca_file: Path | None, tls: ssl.SSLContext | None) ->
 
 
 async def connect_along(route: Route, uri: WebSocketURI, factory: Callable[[], _ConnectionT]) -> _ConnectionT:
-    """Connect to the first address of the host that accepts the connection.
-
-    Raises the OSError of the last address if no address accepts the connection. An SSLError is raised at once.
-    """
+    """Connect to the first address of the host that accepts. If no address accepts, raise the OSError of the last."""
     loop = asyncio.get_running_loop()
     # not by `create_connection`, in which uvloop reports a look-up that fails after the attempt has timed out
     found: list[Any] = await loop.getaddrinfo(uri.host, uri.port, type=SOCK_STREAM)

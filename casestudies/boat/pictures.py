@@ -33,10 +33,7 @@ PCIE: Final = "pcie-gen2"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StageShare:
-    """A stage of a frame: its mean time, and its share of a frame's time.
-
-    `mean_us` is the mean over all frames that report the stage. `share` is relative to the sum of all stages' means.
-    """
+    """A stage of a frame: its mean time over the frames that report it, and its share of the sum over all stages."""
 
     name: str
     part: StageKind

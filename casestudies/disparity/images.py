@@ -26,10 +26,7 @@ class BadImageError(Exception):
 
 
 def read_image(message: Mapping[str, Any], *encodings: str) -> NDArray[Any]:
-    """Return the pixels of a sensor_msgs/Image as an array [height, width].
-
-    Raises a BadImageError if its encoding is not in `encodings`, or if its data are unusable.
-    """
+    """Return a sensor_msgs/Image as an array [height, width]. Raises a BadImageError if it is not in `encodings`."""
     encoding = message.get("encoding")
     if encoding not in encodings:
         raise BadImageError(f"its encoding is {str(encoding)[:20]!r}, expected {' or '.join(encodings)}")

@@ -166,10 +166,7 @@ class MiniCluster:
         return self._boards[board].link is not None or self._boards[board] in self._interrupted
 
     def reopen(self, board: int, *, timeout: float | None = None) -> None:
-        """Reopen a board after the board has restarted or its link has broken. A blank board is programmed.
-
-        Raises a BoardError if the board cannot be opened.
-        """
+        """Reopen a board that has restarted or lost its link, or raise a BoardError. A blank board is programmed."""
         self._open(self._boards[board], self._timeout if timeout is None else timeout)
 
     def close(self) -> None:

@@ -36,10 +36,7 @@ class ResultFile(ABC):
 
     @abstractmethod
     def add(self, frame: FrameOutcome, axes: list[Axis]) -> None:
-        """Save one frame.
-
-        Raises a SettingsError if the file cannot be written or has posteriors of another shape.
-        """
+        """Save one frame, or raise a SettingsError if the file is unwritable or has posteriors of another shape."""
 
     @abstractmethod
     def close(self) -> None:

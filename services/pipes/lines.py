@@ -42,10 +42,7 @@ class LineBoard(msgspec.Struct, omit_defaults=True):
 
 
 class LineResult(msgspec.Struct, kw_only=True):
-    """A result and the reading behind it, sent from `pcie-app` to `publisher`.
-
-    If a variable's reading is an array, its address is -1.
-    """
+    """A result with its reading, sent from `pcie-app` to `publisher`. A reading that is an array has the address -1."""
 
     number: _Unsigned
     stamp_ns: int | None = None
@@ -63,10 +60,7 @@ def require_pipe(command: str, values: str) -> None:
 
 
 def blocking_lines() -> Iterator[tuple[int, bytes]]:
-    """Yield the number and the text of each non-blank line of standard input.
-
-    Raises an InputLineError if a line is longer than `LINE_LIMIT`.
-    """
+    """Yield number and text of each non-blank line of standard input. Raises an InputLineError for a long line."""
     number = 0
     # one byte more than permitted tells a line that is too long from one that just fits
     while line := sys.stdin.buffer.readline(LINE_LIMIT + 1):
@@ -108,10 +102,7 @@ def _too_long(number: int) -> InputLineError:
 
 
 def decoded(line: bytes, number: int, kind: Any, expected: str) -> Any:
-    """Decode the JSON value of a line as the type `kind`.
-
-    Raises an InputLineError if the line is invalid. The message contains `number` and `expected`.
-    """
+    """Decode a line of JSON as the type `kind`, or raise an InputLineError with the line's `number` and `expected`."""
     try:
         return msgspec.json.decode(line, type=kind)
     except (msgspec.MsgspecError, RecursionError) as error:

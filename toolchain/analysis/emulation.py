@@ -43,10 +43,7 @@ class FrameRun:
 
 
 class EmulatedBoards:
-    """Emulated boards among which the lines of one machine are divided.
-
-    Raises a BuildError if `target_count` or `max_cycles` is out of range.
-    """
+    """Boards among which the lines of one machine are divided. Raises a BuildError if a limit is out of range."""
 
     def __init__(
         self, machines: Sequence[BM1Machine], *, target_count: int, max_cycles: int, stop: Stop

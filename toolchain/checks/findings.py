@@ -141,10 +141,7 @@ def code_findings(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def loss_findings(quantised: Quantised, options: BuildOptions) -> Iterator[Finding]:
-    """Find outlier floors that become code 0, and models in which the true line often has code 0.
-
-    An outlier floor is the minimum likelihood of a reading.
-    """
+    """Find outlier floors (minimum likelihoods) that become code 0, and models whose true line often has code 0."""
     for floor in quantised.floors:
         yield warning(Check.VANISHED_FLOOR, floor.name, floor.what, floor.advice)
     mass = sum(loss.mass for loss in quantised.losses)

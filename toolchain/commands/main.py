@@ -96,8 +96,8 @@ def memories(
 def images(directory: Directory, verbose: Verbose = False) -> None:
     """Write the images again from edited memory files and parameters, and report the edits.
 
-    For example, edit build/boat/bm_arch/Memory_MIFs/board0_prior.mif. Run `toolchain regenerate images
-    build/boat`, and program the boards again.
+    For example, edit build/boat/bm_arch/Memory_MIFs/board0_prior.mif, run `toolchain regenerate images build/boat`,
+    and program the boards again.
     """
     from toolchain.building.edited_sources import regenerate_images
 

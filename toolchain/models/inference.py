@@ -287,10 +287,7 @@ class Links:
 
 
 def relevant(factors: Iterable[Factor], asked: set[str]) -> list[Factor]:
-    """Return the factors without the distributions that cannot change the answer, because they sum to 1.
-
-    A distribution is removed if its symbol is not in `asked` and is in no other remaining factor.
-    """
+    """Return the factors without distributions that sum to 1: their symbols are not in `asked` or in other factors."""
     kept = list(factors)
     uses: dict[str, int] = {}
     own: dict[str, int] = {}

@@ -133,10 +133,7 @@ def network_model(
 
 
 def network_of(model: Model) -> NetworkModel:
-    """Return a naive Bayesian fusion as a network. Each of its tables depends on all searched variables.
-
-    Raises a ModelError if a variable selects the prior, or if a variable is both searched and known.
-    """
+    """Return a naive fusion as a network, or raise a ModelError. Each table depends on all searched variables."""
     if model.prior_select is not None:
         raise ModelError(
             f"{model.name}: {model.prior_select.name} selects the prior, which only a BM1 has: build one with "

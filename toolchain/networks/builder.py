@@ -110,10 +110,7 @@ class NetworkBuilder:
     def distribution(
         self, child: str, parents: Sequence[str], values: NDArray[np.float64], place: Place
     ) -> None:
-        """Add P(child | parents), float64[states of the child, states of each parent].
-
-        Sums over the child's states that differ from 1 by at most `ROUNDING` are normalised.
-        """
+        """Add P(child | parents), float64[child's size, parents' sizes]. Sums within `ROUNDING` of 1 are normalised."""
         if child in self._children:
             raise place.error(f"{child} has two tables")
         self._children.add(child)
