@@ -76,7 +76,7 @@ class _Frame(NamedTuple):
 
 
 def store_of_codes(occurring: npt.NDArray[np.bool_], slots: int) -> _Store:
-    """Allocate a store with a row for each code that may occur. The words of the rows are not computed yet."""
+    """Allocate a store with a row for each code that may occur. The words are not computed yet."""
     row_of_code = np.full(occurring.shape, NO_ROW, dtype=np.int32)
     row_column, row_code = np.nonzero(occurring)
     row_of_code[occurring] = np.arange(len(row_code), dtype=np.int32)

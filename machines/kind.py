@@ -163,7 +163,7 @@ class BoardMachine(ABC):
         self._memory = memory
 
     def prepare(self) -> None:
-        """Prepare the machine, so that its first frames are not slower than later frames, and reset it."""
+        """Do work in advance that would slow down the first frames, and reset the machine."""
         self.reset()
 
     @abstractmethod

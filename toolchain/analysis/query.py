@@ -43,7 +43,7 @@ class MachineAnswer:
     posterior: NDArray[np.float64] | None
     """float64[lines], one value for each combination of searched states, or None if all counts are 0."""
     total_variation: float
-    """Total variation distance to the exact posterior, or 1 if the machine has no posterior."""
+    """Total variation from the exact posterior, or 1 if the machine has no posterior."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

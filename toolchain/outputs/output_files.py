@@ -171,7 +171,7 @@ def image_files(deployment: Deployment, images: Sequence[Image]) -> OutputFiles:
 
 
 def filter_file(transition: Transition | None) -> OutputFiles:
-    """Return the file with a filter's transition, or no file if `transition` is None."""
+    """Return the file of a filter's transition, or no file if it is None."""
     name = str(FilterSection.model_fields["file"].default)
     return OutputFiles(
         {} if transition is None else {name: [transition.content()]}, re.compile(re.escape(name))

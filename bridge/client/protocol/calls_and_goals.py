@@ -82,7 +82,7 @@ class PendingCalls(_Pending):
         return call
 
     def receive(self, operation: dict[str, Any], data: bytes) -> CallAnswered | UnusableReceived | None:
-        """Handle a service_response. Return the event for the program, or None if no call waits for the response."""
+        """Handle an answer. Return the answer as an event, or None if no call waits for it."""
         call = operation.get("id")
         if not isinstance(call, str):
             return UnusableReceived(f"a service_response without the id of a call arrived: {excerpt(data)}")
@@ -235,7 +235,7 @@ class ServedServices(_Served):
         del self._requests[ticket]
 
     def receive(self, operation: dict[str, Any], data: bytes) -> ServiceRequested | UnusableReceived | None:
-        """Handle a call_service. Return the event for the program, or None if this client refused the request."""
+        """Handle a request. Return the request as an event, or None if this client refused it."""
         service = operation.get("service")
         args = operation.get("args")
         wire_id = operation.get("id")
