@@ -50,11 +50,7 @@ class BM1Kind(MachineKind):
     }
 
     def due_sections(self, parameters: BM1Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-        """Yield the name, type and shape of each section that a file must have.
-
-        The sections are the prior, a table for each column (a MIF in the thesis), and a table of random numbers. A
-        section is absent if the machine does not have the table.
-        """
+        """Yield the sections of a file: the prior, any tables of columns (MIFs in the thesis) and of random numbers."""
         yield "prior", "<u2", (parameters.prior_addresses, parameters.lines)
         if parameters.has_tables:
             for column, bits in enumerate(parameters.sensor_bits, start=1):

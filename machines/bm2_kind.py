@@ -1,7 +1,7 @@
 """BM2 as a machine kind: sections of the programming file, registers, frames and posteriors (thesis 2.1.3).
 
-After each start or resume, a board draws one batch of samples. If a board has a stream, which stores the samples, it
-draws as many samples as the stream's buffer holds.
+After each start or resume, a board draws one batch of samples. A board that stores samples in a stream draws as many
+as the stream's buffer holds.
 """
 
 import math
@@ -70,11 +70,7 @@ class BM2Kind(MachineKind):
     }
 
     def due_sections(self, parameters: BM2Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-        """Yield the name, type and shape of each section that a file must have.
-
-        Each CDE has a section. Each factor has a section that marks the factor's non-zero entries. The last section is
-        the table of random numbers, if the machine has this table.
-        """
+        """Yield the sections of a file: each CDE, each factor's non-zero entries, and any table of random numbers."""
         for at in range(parameters.cdes):
             bits = len(parameters.factor_bits(at))
             yield f"cde {at}", "<u2", (bits << bits >> 1,)

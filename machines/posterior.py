@@ -42,7 +42,7 @@ def posterior_of_lines(
 ) -> npt.NDArray[np.float64] | None:
     """Return the same posterior as `joint_posterior`, from the concatenated counts of all boards, uint32[all lines].
 
-    `lines` and `cycles` have a number for each board. Raises a MachineError if a board has counts without cycles.
+    Raises a MachineError if a board has counts without cycles.
     """
     if min(cycles) <= 0:
         end = 0

@@ -97,7 +97,7 @@ def parse_endpoint(text: str) -> Endpoint:
 def listen(endpoint: Endpoint) -> socket.socket:
     """Return a listening socket. Raises an EndpointError if the endpoint cannot be used.
 
-    A unix socket has mode 0600. If a process that has ended left a socket file at the path, the file is replaced.
+    A unix socket has mode 0600. It replaces the socket file of a process that has ended.
     """
     try:
         if not endpoint.path:

@@ -27,7 +27,7 @@ _received: list[int] = []
 
 
 def stopped_error(number: int) -> StoppedError:
-    """Return the error for a signal that ends a process. The error has the exit code and the sentence of the signal."""
+    """Return the error, with exit code and sentence, for a signal that ends a process."""
     return StoppedError(*_ENDS[signal.Signals(number)])
 
 
@@ -36,9 +36,9 @@ def raise_on_signals() -> None:
 
     A second signal is ignored, because the clean-up after the first signal always ends within a limited time.
 
-    Code must call `check_signals` before it blocks, as `run_async` does. The reason is that the exception can be lost.
-    Python drops it while the thread runs a callback from C code, forks, or runs a finaliser. C code may also print it
-    and raise another exception instead, as numba does while it is imported.
+    Before code blocks, it must call `check_signals`, as `run_async` does, because the exception can be lost. Python
+    drops it while the thread runs a callback from C code, forks, or runs a finaliser. C code may print it and raise
+    another exception, as numba does while it is imported.
     """
     sys.unraisablehook = _report_dropped
     sys.excepthook = _report_printed

@@ -73,9 +73,9 @@ def in_this_process(job: Job, numbers: Sequence[int], keep: Keep) -> None:
 
 
 def in_order(run: Run, job: Job, numbers: Sequence[int], advance: Callable[[], None]) -> list[Any]:
-    """Do the pieces with these numbers, call `advance` after each piece, and return the results.
+    """Do the pieces with these numbers, and call `advance` after each piece.
 
-    Results may arrive in any order. They are returned in the order of `numbers`, because sums of floats depend on it.
+    The results are returned in the order of `numbers`, because sums of floats depend on the order.
     """
     found: dict[int, Any] = {}
 
@@ -147,10 +147,7 @@ def _check_certificates(files: dict[str, Path | None]) -> None:
 
 @contextmanager
 def runner(options: SchedulerOptions) -> Iterator[Run]:
-    """Yield a function that does pieces of work in the place that the options choose.
-
-    Raises a ClusterError if the scheduler cannot be used.
-    """
+    """Yield a function that does pieces of work where the options say. If that is impossible, raise a ClusterError."""
     address = options.scheduler
     if address is None:
         yield in_this_process

@@ -17,10 +17,7 @@ class ToolchainError(Exception):
         line: int | None = None,
         place: tuple[str | int, ...] = (),
     ) -> None:
-        """Prefix the sentence with the path and line of a file.
-
-        `place` is the position of the wrong key in the file, for example `("variable", 2, "bits")`.
-        """
+        """Prefix the sentence with path and line. `place` is the wrong key, such as `("variable", 2, "bits")`."""
         where = f"{path}" + ("" if line is None else f", line {line}")
         super().__init__(f"{where}: {sentence}" if where else sentence)
         self.path = path
@@ -62,7 +59,7 @@ class DeploymentVersionError(DeploymentError):
 
 
 class DamagedDeploymentError(DeploymentError):
-    """A file of the deployment has changed since the build: the hash of the file differs from the recorded hash."""
+    """A file of the deployment has changed since the build: its hash differs from the recorded hash."""
 
 
 class ReadingError(ToolchainError):

@@ -69,8 +69,7 @@ class AccessPolicy:
         """Return the HTTP status with which to refuse a request, or None to admit it.
 
         If the hub listens on a loopback address (`loopback`), the request's `Host` must be this machine or the host of
-        an allowed web page. Another `Host` is a sign of DNS rebinding: a web page has made its own name resolve to
-        this machine.
+        an allowed web page. Another `Host` is a sign of DNS rebinding: a page made its name resolve to this machine.
         """
         if loopback and not self._is_for_this_machine(request):
             return HTTPStatus.FORBIDDEN

@@ -1,7 +1,7 @@
 """Definitions of services, actions and messages that `rosbags` does not have, in ROS's own notation.
 
-The module has only the definitions that rosbridge clients use most: the services of `std_srvs` and of rosapi, the
-actions of the ROS tutorials, and `tf2_msgs`. The sources are the packages' own `.srv`, `.action` and `.msg` files.
+Clients of rosbridge often use these definitions: the services of `std_srvs` and of rosapi, the actions of the ROS
+tutorials, and `tf2_msgs`. The sources are the packages' own `.srv`, `.action` and `.msg` files.
 """
 
 from functools import cache
@@ -171,10 +171,7 @@ def part_name(type_name: str, part: str, ros_version: RosVersion) -> str:
 
 @cache
 def message_texts(ros_version: RosVersion) -> dict[str, str]:
-    """Return message definitions by message name, including the parts of services and actions.
-
-    The names always have the form of ROS 2, such as `tf2_msgs/msg/TFMessage`.
-    """
+    """Return message definitions by name (such as `tf2_msgs/msg/TFMessage`), with the parts of services and actions."""
     rosapi = "rosapi_msgs" if ros_version == 2 else "rosapi"
     own = _ROSAPI | (_ROSAPI_2 if ros_version == 2 else {})
     services = _SERVICES | {f"{rosapi}/{name}": text for name, text in own.items()}

@@ -174,8 +174,7 @@ class SocketLink:
     def open(cls, endpoint: Endpoint, *, timeout: float, connect_timeout: float | None = None) -> Self:
         """Open a link to a board that has this protocol version and register map.
 
-        The board must listen and greet within `connect_timeout` seconds (by default `timeout`). It must send each
-        answer within `timeout` seconds.
+        The board must greet within `connect_timeout` seconds (default: `timeout`), and answer within `timeout` seconds.
 
         Raises:
             LinkUnreachableError: No board listens at the endpoint.
@@ -244,10 +243,7 @@ class SocketLink:
         self.write_block(address, WORD.pack(value))
 
     def read_block(self, address: int, count: int) -> bytes:
-        """Read `count` words from `address` on, as little-endian bytes.
-
-        Raises a ShortReadError if fewer or more words arrive.
-        """
+        """Read `count` little-endian words from `address` on. If fewer or more words arrive, raise a ShortReadError."""
         self.ask([(address, count)])
         return self.answers()[0]
 
@@ -270,10 +266,9 @@ class SocketLink:
         self._send(b"".join(requests))
 
     def answers(self) -> list[bytes]:
-        """Return the words of each block that `ask` has requested, in order, as little-endian bytes.
+        """Return, in order, each block that `ask` has requested, with the format and errors of `read_block`.
 
-        Raises a ShortReadError if fewer or more words arrive. After an AccessError, the caller must close the link,
-        because answers to later requests may still arrive.
+        After an AccessError, the caller must close the link, because answers to later requests may still arrive.
         """
         asked, self._asked = self._asked, []
         blocks = []
@@ -291,10 +286,7 @@ class SocketLink:
         return blocks
 
     def post(self, writes: Iterable[RegisterWrite]) -> None:
-        """Send writes without waiting for replies.
-
-        If the board refuses a write, receiving the next answer or interrupt raises the error.
-        """
+        """Send writes without waiting for replies. If the board refuses a write, the next receive raises the error."""
         self._send(b"".join(self._posted(framing.WRITE, address, words) for address, words in writes))
 
     def post_part(self, offset: int, part: Octets) -> None:

@@ -69,8 +69,7 @@ def fused_services(
 ) -> dict[str, tuple[FusedEnd, Coroutine[Any, Any, int]]]:
     """Return, for each of the three roles, the master's end of the link and the coroutine that runs the service.
 
-    `to_master` takes a role, and returns the function with which the master receives the records of this role. Raises
-    a SettingsError if an endpoint is wrong.
+    `to_master` returns the function that receives the records of a role. Raises a SettingsError for a wrong endpoint.
     """
     # filled by the constructors of the services, which make their links
     ends: dict[str, FusedEnd] = {}

@@ -3,8 +3,8 @@
     master ──FrameRequest──▶ posted ──the last board is done──────▶ FrameResult ──▶ master
                         └──a board fails──▶ lost boards are found ──▶ FrameFailed ──▶ master
 
-At most one frame is on the boards at a time. A thread opens boards, finds lost boards and recovers lost boards. During
-this slow work, no frame is posted.
+At most one frame is on the boards at a time. Slow work (opening, searching and recovering boards) runs in a thread.
+During slow work, no frame is posted.
 """
 
 import asyncio

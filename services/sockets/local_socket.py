@@ -1,7 +1,7 @@
 """Local sockets between services: length-prefixed MessagePack records, and the handshake.
 
-A framed record begins with four bytes (little-endian) that give the number of bytes of MessagePack after them.
-`RecordSplitter` decodes records and performs no I/O. `RecordProtocol` is a connection in asyncio.
+A framed record is its length in four bytes (little-endian), followed by that many bytes of MessagePack.
+`RecordSplitter` decodes records without I/O. `RecordProtocol` is a connection in asyncio.
 """
 
 from __future__ import annotations
@@ -44,10 +44,7 @@ class RecordSplitter:
         self._pending = bytearray()
 
     def feed(self, data: bytes) -> list[AnyRecord]:
-        """Add received bytes, and return the records that are now complete, in order.
-
-        Raises a LocalSocketError if the bytes are not a record, or if a record is larger than `MAX_RECORD`.
-        """
+        """Add bytes, and return the records now complete. If bytes are not a record, raise a LocalSocketError."""
         pending = self._pending
         pending += data
         records: list[AnyRecord] = []
