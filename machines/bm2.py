@@ -32,7 +32,7 @@ FACTOR_BITS_MAX: Final = 20
 """Maximum total number of bits of a factor's variables. A factor of 20 bits has 20 * 2**19 codes, or 20 MB."""
 
 RESULT_WORDS_MAX: Final = 4096
-"""Maximum number of words of all histograms, with the joint histogram. The register map's RESULTS has this size."""
+"""Maximum number of words of all histograms, including the joint histogram. RESULTS has this size."""
 
 CHAINS_MAX: Final = 65536
 """Maximum number of boards that run chains of one model."""
@@ -51,7 +51,7 @@ SEARCH_MAX: Final = 150_000
 
 
 class BM2StopReason(IntEnum):
-    """The reason why a BM2 stopped, with the numbers that the status register has for the reasons."""
+    """The reason why a BM2 stopped, with the number of the reason in the status register."""
 
     NONE = 0
     """The machine has not run since the reset."""

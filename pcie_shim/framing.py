@@ -25,7 +25,7 @@ WRITE: Final = 3
 IRQ: Final = 4
 """Board to host: the machine has stopped.
 
-The payload contains the registers from DONE to COMPUTE_NS. If `CAP_LINK.SENDS_RESULTS` is 1, the results follow.
+The payload contains the registers from DONE to COMPUTE_NS. If `CAP_LINK.SENDS_RESULTS` is 1, the result blocks follow.
 """
 ERROR: Final = 5
 """Board to host: the board refused the request that has this sequence number (`encode_error`)."""
@@ -209,7 +209,7 @@ NO_TOKEN: Final = bytes(8)
 
 
 class ProgramBegin(NamedTuple):
-    """A loader's announcement of a file of `size` bytes. `token` is that of the host's board link or `NO_TOKEN`."""
+    """A loader's announcement of a file of `size` bytes. `token` is the token of the host's link, or `NO_TOKEN`."""
 
     size: int
     sha256: bytes

@@ -46,7 +46,7 @@ def _plane(axes: Sequence[Axis], values: NDArray[Any]) -> tuple[list[Axis], NDAr
 
 
 def as_html(axes: Sequence[Axis], values: NDArray[np.float64], facts: Iterable[str]) -> str:
-    """Return HTML with a table of the axes, facts and a picture. Viewers remove scripts and styles, so it has none."""
+    """Return HTML with a table of the axes, facts and a picture. It has no scripts or styles: viewers remove them."""
     best = np.unravel_index(values.argmax(), values.shape)
     rows = [
         (

@@ -243,7 +243,7 @@ class Process:
         return error
 
     async def wait(self) -> int:
-        """Wait until the process has ended and all its lines are read, and return its exit code."""
+        """Wait until the process has ended and all its lines have been read. Return the exit code."""
         if self._reader is not None:
             await self._reader
         code = await self._process.wait() if self._process else 0
@@ -276,10 +276,10 @@ class Process:
 
 
 class Screen:
-    """The output of a script: its lines and, if no line is due, the work that the script waits for.
+    """The output of a script: its lines and, when no line comes for a while, the work that the script waits for.
 
-    On a terminal, a line shows the work and the time so far. The next line replaces it. Elsewhere, a line names the
-    work, and dots follow.
+    On a terminal, a temporary line shows the work and the time so far. Elsewhere, a line names the work, and dots
+    follow.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Files of bounded size and depth. Errors of reading name file and line, and writing replaces the whole file."""
+"""Files of bounded size and depth. Errors name the file and the line, and writing replaces the whole file."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ class TomlFile:
     error: type[ToolchainError]
     """Type of the errors about the file."""
     text: str
-    """Text of the file. Errors look up the lines of mistakes in it."""
+    """Text of the file, for finding the line of a mistake."""
     tables: dict[str, Any]
     """Tables of the file, before their validation."""
 

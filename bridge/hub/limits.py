@@ -41,7 +41,7 @@ class HubError(BridgeError):
 
 
 class RefusedOperationError(BridgeError):
-    """Raised when the hub refuses an operation. The text is logged, and answers a call or a goal."""
+    """Raised when the hub refuses an operation. The text is logged, and is the answer to a call or a goal."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -73,7 +73,7 @@ def tiles_of(codes: NDArray[np.uint8], pixels: int) -> NDArray[np.uint8]:
 
 
 class Stack:
-    """The running stack of master and boards. It computes posteriors of tiles of likelihoods for the matcher."""
+    """The running stack of master and boards, which computes posteriors from the matcher's likelihoods."""
 
     def __init__(
         self, tiles: LossyPublication, heard: Posteriors, ros: Ros, *, first_limit_s: float, limit_s: float

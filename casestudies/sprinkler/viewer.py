@@ -53,7 +53,7 @@ class FrameSummary:
     effective: float
     """Number of effective samples, from `/bm/frame`. If the report lacks it, the value is 1."""
     curve: NDArray[np.int64]
-    """int64[points, 2]: a number n, and how many of the first n samples have R = 1. The last n is the total."""
+    """int64[points, 2]: n, and how many of the first n samples have R = 1. The last n is the number of all samples."""
 
 
 def frame_of(posterior: Posterior, samples: NDArray[np.int64]) -> FrameSummary:
@@ -122,7 +122,7 @@ class SamplesViewer:
         self._unclaimed: list[NDArray[np.int64]] = []  # without a frame yet, in the order of arrival
 
     async def watch(self, uri: str, *, first_limit_s: float, limit_s: float) -> None:
-        """Listen until the number of results to wait for has arrived, and print a line for each result.
+        """Listen until the requested number of results has arrived, and print a line for each result.
 
         Raises:
             NoResultError: No result, or no samples, came in time.

@@ -113,7 +113,7 @@ def _await_free(endpoint: Endpoint, limit: float) -> None:
 
 
 class BoardProcesses:
-    """Boards from 0 to `count` - 1, each in a fork of this process. The forks share the kernels that it has loaded."""
+    """Boards from 0 to `count` - 1, each in a fork of this process. All forks share the kernels loaded here."""
 
     def __init__(
         self,
@@ -123,7 +123,7 @@ class BoardProcesses:
         settings: Settings,
         hardware: SimulatedHardware | None = None,
     ) -> None:
-        """Prepare boards with sockets in `directory`. `restarts` limits restarts in the time `restart_window`."""
+        """Put sockets of boards into `directory`. At most `restarts` restarts may happen within `restart_window`."""
         self._endpoints = [endpoint_in(directory, f"board{at}") for at in range(count)]
         self._settings = settings
         self._hardware = hardware
@@ -153,7 +153,7 @@ class BoardProcesses:
         self._announced = False
 
     def run(self) -> NoReturn:
-        """Keep the boards running until a signal ends this process. If they exit too often, raise a BoardFailedError."""
+        """Keep the boards running until a signal ends this process. If they exit too often, raise BoardFailedError."""
         from machines import warm_up
 
         # children share these pages, because four imports of numba would take 1.6 s

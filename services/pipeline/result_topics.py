@@ -73,7 +73,7 @@ class ResultTopics:
 
     @contextlib.asynccontextmanager
     async def opened(self, on_state: OnState | None = None) -> AsyncIterator[str]:
-        """Connect to the servers and advertise the topics, or raise a BridgeError. Yield a sentence that names both."""
+        """Connect and advertise, or raise a BridgeError. Yield a sentence that names the topics and the servers."""
         settings, deployment = self._settings, self._deployment
         by_uri = self.rosbridges
         async with contextlib.AsyncExitStack() as stack:
@@ -95,7 +95,7 @@ class ResultTopics:
             yield f"publishing on {topics} at {', '.join(by_uri)}"
 
     def served_by(self, uri: str) -> tuple[str, str]:
-        """Return two texts about a server: its topics and its name. For the only server, the first text is empty."""
+        """Return two texts about a server: its topics and its name. With a single server, the first text is empty."""
         if len(self.rosbridges) == 1:
             return "", "rosbridge"
         topics = [publication.topic for ros, publication in self._outputs if ros is self.rosbridges.get(uri)]

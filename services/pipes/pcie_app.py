@@ -1,4 +1,4 @@
-"""`pcie-app` without a master. It computes the readings of standard input on boards, and prints the counts."""
+"""`pcie-app` without a master. It takes readings from standard input, runs them on boards, and prints the counts."""
 
 from collections.abc import Mapping
 

@@ -38,7 +38,7 @@ class LossReason(StrEnum):
     PASSED_OVER = "passed over"
     """A newer reading replaced the reading (with `queue = latest`)."""
     UNPAIRED = "unpaired"
-    """A message of one topic had no message of another topic within the tolerance."""
+    """A message arrived, but no message of another topic arrived within the tolerance."""
     TOO_LARGE = "too large"
     """A message was larger than the limit of its topic (`topic_bytes`)."""
     UNUSABLE = "with an unusable variable"
@@ -102,7 +102,7 @@ class Ready(Record, tag="ready", frozen=True):
 class Rosbridge(Record, tag="rosbridge", frozen=True):
     """The subscriber or publisher tells the master whether it is connected to a rosbridge server now.
 
-    If the subscriber or publisher is connected again, the master tells the other. The other then reconnects at once.
+    If one of the two services is connected again, the master tells the other service, so that it reconnects at once.
     """
 
     connected: bool
@@ -165,7 +165,7 @@ class Reading(Record, tag="reading", frozen=True):
 
 
 class Unusable(Record, tag="unusable", frozen=True):
-    """The subscriber reports an unusable message to the master. Messages with equal flaws have the same `cause`."""
+    """The subscriber reports an unusable message to the master. Messages with the same flaw have the same `cause`."""
 
     cause: str
     sentence: str
@@ -208,7 +208,7 @@ class FrameFailed(Record, tag="failed", frozen=True):
 
 
 class Publish(Record, tag="publish", frozen=True):
-    """The master sends the publisher a result, with the data of its frame."""
+    """The master sends the publisher a frame's result, and the data for the frame's report."""
 
     result: FrameResult
     # Times of its reading, for the report of the frame and its latency.

@@ -154,7 +154,7 @@ class Question:
     prior_select: Symbol | None
     """The symbol that selects the prior, or None."""
     previous: tuple[Symbol, ...] = ()
-    """For a filter, the symbols of the previous frame, in the order of `searched`. Otherwise empty."""
+    """For a filter, the symbols of the previous frame, in the order of `searched`. Without a filter, it is empty."""
 
     def __repr__(self) -> str:
         known = [*(each.name for each in self.observed), *(f"{name}={at}" for name, at in self.given.items())]
