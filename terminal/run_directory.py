@@ -3,9 +3,9 @@
     $XDG_RUNTIME_DIR/rosbayes, otherwise /tmp/rosbayes-UID    unless BM_RUN_DIRECTORY or --run-directory names one
         master.status.sock  subscriber.sock  board0.sock  ...
 
-Only this user can enter the default directory. A master that starts processes locks the run directory with flock. The
-child processes inherit the lock. The kernel releases the lock when the master and all child processes have ended, even
-after a kill. The next start replaces the sockets of killed processes.
+Only this user can enter the default directory. A master that starts processes locks the run directory with flock. Child
+processes inherit the lock. The kernel releases the lock when master and child processes have ended, even after a kill.
+The next start replaces the sockets of killed processes.
 """
 
 import contextlib

@@ -1,4 +1,4 @@
-"""Comparison of the machines' disparities with float64 fusion, the truth and the thesis, as text and as a picture."""
+"""Comparison of the machines' disparities with float64 fusion, the truth and the thesis, as text and picture."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +12,7 @@ from terminal.pictures import new_figure, save_figure
 THESIS_S: Final = 0.6
 """Seconds in which the thesis's host computes the matching costs of a pair (4.4). The thesis gives no image size."""
 UNKNOWN: Final = -1.0
-"""The value that replaces the disparity of a pixel without a posterior."""
+"""Value for the disparity of a pixel without a posterior."""
 _BAD: Final = 1.0
 """Largest error in pixels for which a disparity is not counted as bad."""
 HEADING: Final = "pair  host (ms)  pairs/s  projected/s    cycles  bad float64  bad BM1  agreement  variation"

@@ -69,7 +69,7 @@ class Doors:
             await self._app(scope, receive, _with_headers(send))
 
     def refusal(self, headers: Headers, token: str = "") -> HTTPStatus | None:
-        """Return the HTTP status with which to refuse a request with these headers, or None to admit the request."""
+        """Return the HTTP status that refuses a request with these headers, or None to admit the request."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not self._is_our_name(hosts[0]):
             return HTTPStatus.FORBIDDEN

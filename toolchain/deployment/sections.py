@@ -321,9 +321,9 @@ class BM1Section(CommonSection):
     is_divided: ClassVar[bool] = True
     """True if each board has only a part of the lines, as in a BM1. False if each board has the whole machine."""
     stream: ClassVar = 0
-    """Number of sampled states that a board buffers for publication. A BM1 samples no states, so the number is 0."""
+    """Number of sampled states that a board buffers for publication. A BM1 samples no states."""
     variables: ClassVar[tuple[str, ...]] = ()
-    """Names of the variables in a sampled state. A BM1 samples no states, so there are no names."""
+    """Names of the variables in a sampled state. A BM1 samples no states."""
 
     @model_validator(mode="after")
     def _target_fits(self) -> Self:

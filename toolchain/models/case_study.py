@@ -58,7 +58,7 @@ def load_question(case: Path, settings: Mapping[str, str]) -> Model | Question:
 def installed_models() -> dict[str, Path]:
     """Return the files of the models that are installed with rosbayes, by name, such as `boat`.
 
-    The function searches the package `casestudies` without an import, because the toolchain imports no case study.
+    The function finds the files without importing a case study.
     """
     package = importlib.util.find_spec("casestudies")
     folders = (package and package.submodule_search_locations) or ()
