@@ -32,7 +32,7 @@ from terminal.run_directory import status_directory
 from terminal.signals import run_async
 
 RECENT_S: Final = 10.0
-"""Maximum seconds since the last work of a process that is ready."""
+"""A process is ready if its last work was at most this many seconds ago."""
 
 
 class Readiness:

@@ -65,7 +65,7 @@ class OverflowedQueueError(StackError):
 
 
 class OutdatedError(StackError):
-    """A service has read its deployment folder before a change, and the master requires the new deployment."""
+    """A service still uses an old version of its deployment folder, and the master requires the new version."""
 
     exit_code = ExitCode.CHILD
 

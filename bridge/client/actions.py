@@ -105,7 +105,7 @@ class Goal:
         return self._ended.done()
 
     async def cancel(self) -> None:
-        """If the goal is active, ask the server to cancel it. The status of the result shows whether it was cancelled."""
+        """If the goal is active, ask the server to cancel it. The result's status shows whether it was cancelled."""
         self._session.check_thread()
         self._session.core.goals.cancel(self._identity)
         self._session.flush()

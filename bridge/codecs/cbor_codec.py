@@ -221,7 +221,7 @@ def with_arrays(value: Any) -> Any:
 
 
 def with_lists(value: Any) -> Any:
-    """In a message, replace every NumPy array in place: uint8 by `bytes`, other arrays by lists of numbers."""
+    """In a message, convert NumPy arrays in place. A uint8 array becomes `bytes`, any other array a list of numbers."""
     import numpy as np
 
     def list_of(part: Any) -> Any:

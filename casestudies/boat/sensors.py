@@ -61,9 +61,9 @@ ARRAY_TYPE: Final = "std_msgs/Float64MultiArray"
 TRUE_POSE_TOPIC: Final = "/boat/true_pose"
 TRUE_POSE_TYPE: Final = "geometry_msgs/PoseStamped"
 SET_POSE_TOPIC: Final = "/boat/set_pose"
-"""Topic for poses to which the boat is moved, of `TRUE_POSE_TYPE`. Any client may publish them."""
+"""Topic of poses, of the type `TRUE_POSE_TYPE`. Any client may publish a pose to move the boat there."""
 DRIVE_TOPIC: Final = "/cmd_vel"
-"""Topic for velocities that drive the boat, of `DRIVE_TYPE`. Any client may publish them."""
+"""Topic of velocities, of the type `DRIVE_TYPE`. Any client may publish a velocity to drive the boat."""
 DRIVE_TYPE: Final = "geometry_msgs/Twist"
 COMPASS_TOPIC: Final = "/boat/imu"
 COMPASS_TYPE: Final = "sensor_msgs/Imu"
@@ -175,7 +175,7 @@ def readings_message(
     """Return a message with six readings, in the order of `SENSOR_NAMES`, and with the header `head` if it is given.
 
     With `array`, the message is a std_msgs/Float64MultiArray, which has no header. A missing reading (None) becomes
-    null in an array, because rosbridge writes NaN as null. In any other message, its field is absent.
+    null in an array, because rosbridge writes NaN as null. In a message with named fields, its field is absent.
     """
     if array:
         return {

@@ -22,7 +22,7 @@ TRUTH_TOPIC: Final = "/stereo/true_disparity"
 DISPARITY_TOPIC: Final = "/stereo/disparity"
 TILE_TOPIC: Final = "/disparity/likelihoods"
 TILE_TYPE: Final = "disparity_msgs/Likelihoods"
-"""Message type with a header and a `uint8[]` field for each filter, which has the filter's name.
+"""Type of messages with a header and, for each filter, a `uint8[]` field with the name of the filter.
 
 The field of a filter contains a likelihood from 0 to 255 for each pixel and disparity.
 """
@@ -32,7 +32,7 @@ _COSTS: Final = 64
 
 
 def model(disparities: int = DISPARITIES) -> Question:
-    """Return the question: which disparity does a pixel have, given the matching costs of three filters?
+    """Return the question for the disparity of a pixel, given the matching costs of three filters.
 
     Args:
         disparities: The number of disparities. The smallest disparity is 0.

@@ -162,9 +162,9 @@ def read_track(folder: Path, robot: int) -> Track:
 
 
 def read_measured(folder: Path, robot: int, subjects: dict[int, int]) -> tuple[list[Measured], int]:
-    """Return a robot's sightings of landmarks from `RobotN_Measurement.dat`, and the number of misread barcodes.
+    """Return a robot's sightings of landmarks from `RobotN_Measurement.dat`, and the number of misread sightings.
 
-    A barcode counts as misread if no subject has it, or if its range is negative.
+    A sighting counts as misread if its barcode is unknown or its range is negative.
     """
     path = folder / f"Robot{robot}_Measurement.dat"
     found, misread = [], 0

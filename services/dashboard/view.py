@@ -54,7 +54,7 @@ class View:
         self._feed.changed()
 
     def step(self, frames: int) -> None:
-        """Pause, and move forward by `frames`, or back if `frames` is negative. Stop at the end of the kept frames."""
+        """Pause, and move forward by `frames`, or back if negative. Stop at the first or last frame that is kept."""
         if (frame := self.frame) is not None:
             found = self._feed.frame(frame.at + frames)
             self.at = found.at if found is not None else None

@@ -58,7 +58,7 @@ _RECONNECT_TIME = 60.0
 
 
 class Peer:
-    """A service that the master uses, with its connection. If the master starts it, the peer also has its process.
+    """A service that the master uses, with its connection. If the master starts the service, `child` is its process.
 
     A service inside the master's process has no endpoint.
     """
@@ -259,7 +259,7 @@ class Peers:
         return 0.0 if self._boards is None else COMPILING_TIME
 
     async def start(self, events: PeerEvents) -> None:
-        """Start the services that do not run yet, and connect to all. From then on, restore lost connections."""
+        """Start processes that do not run yet, and connect to all services. From then on, restore lost connections."""
         self._events = events
         if self._boards is not None:
             await self._boards.start()

@@ -42,7 +42,7 @@ _MOVE_CYCLES: Final = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedChain:
-    """The machine of a BM2's first board, for the checks. Without `model`, hidden variables have numbers as values."""
+    """The machine of a BM2's first board, for the checks. Without `model`, values of hidden variables have no names."""
 
     deployment: Deployment
     machine: BM2Machine
@@ -62,7 +62,10 @@ class CheckedChain:
         return tuple(f"CDE {at} ({scope})" for at, scope in enumerate(scopes))
 
     def state(self, values: Sequence[int], variables: Sequence[int]) -> str:
-        """Return a state as text, `rain = yes, grass = wet`, with only the variables at the indices `variables`."""
+        """Return a part of a state as text: `rain = yes, grass = wet`.
+
+        `values` has the values of all variables, and `variables` has the indices of the variables to show.
+        """
         p, deployment = self.machine.parameters, self.deployment
         if self.model is None:
             labels = dict(zip(p.known, (each.states for each in deployment.variables), strict=True))

@@ -92,7 +92,7 @@ def with_fit(model: Model, path: Path | None) -> Model:
 
 
 def apply_fit(model: Model, fit: Fit, where: str = "the fit") -> Model:
-    """Return the model with the tables of a fit, or raise a ModelError. Tables that are not in the fit do not change."""
+    """Return the model with the learnt tables of a fit, or raise a ModelError. All other tables stay unchanged."""
     known = {each.name: each for each in model.known}
     for variable in fit.file.variables:
         if variable.name not in known:
@@ -125,7 +125,7 @@ def apply_fit(model: Model, fit: Fit, where: str = "the fit") -> Model:
 def cell_spread(model: Model, known: Known) -> NDArray[np.float64]:
     """Return how much a variable's mean varies within each line's cell, as a standard deviation: float64[lines].
 
-    The mean is taken as linear in the searched values, and these values as uniform within the cell.
+    The mean is assumed linear in the searched values, and the searched values are assumed uniform within the cell.
     """
     slopes = mean_slopes(model, known)
     spread: NDArray[np.float64] = np.sqrt((slopes**2).sum(axis=0) / 12)
@@ -133,7 +133,7 @@ def cell_spread(model: Model, known: Known) -> NDArray[np.float64]:
 
 
 def normal_of(known: Known) -> Normal:
-    """Return the normal distributions from which a variable's table was computed. Raises a ModelError without any."""
+    """Return the normal distributions behind a variable's table, or raise a ModelError for a table of another kind."""
     if known.normal is None:
         raise ModelError(
             f"{known.name} is not normal around a mean in the model; fit it with --method counts"

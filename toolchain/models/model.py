@@ -21,7 +21,7 @@ from toolchain.deployment.sections import NAME_MAX
 from toolchain.errors import ModelError
 
 MAX_LINES: Final = 2**24
-"""Maximum number of lines of a model, which is the product of the sizes of the searched dimensions.
+"""Maximum number of lines of a model. The number of lines is the product of the searched dimensions' sizes.
 
 4,096 boards have this number of lines if each board has as many lines as the register map permits.
 """
@@ -81,7 +81,7 @@ class TabulatedVariable:
     unit: str = ""
     """The unit of the variable's readings, such as `m`, for display."""
     period: int | None = None
-    """Number of addresses in one turn of a cyclic reading, such as a bearing; None for other readings."""
+    """Number of addresses in one turn of a cyclic reading, such as a bearing, or None for other readings."""
     on_range: Literal["error", "clamp", "missing"] = "error"
     """What a reading out of range becomes: an error, the nearest end of the range, or a missing reading."""
     on_missing: Literal["error", "missing"] = "error"
@@ -117,7 +117,7 @@ class TabulatedVariable:
 
 
 def checked_variable(*, name: str, **rule: Any) -> Variable:
-    """Return an entry of `deployment.toml` with the keys `rule`, or raise a ModelError if a key would be invalid."""
+    """Return a `deployment.toml` entry with the keys `rule`, or raise a ModelError if the entry would be invalid."""
     try:
         return Variable(name=name, **rule)
     except ValidationError as reason:
@@ -134,7 +134,7 @@ class Known(TabulatedVariable):
     Quantising warns if the codes cannot express the minimum.
     """
     normal: Normal | None = field(default=None, repr=False)
-    """The normal distributions from which the table was computed, or None if it was not computed from any."""
+    """The normal distributions from which the table was computed, or None for a table from another source."""
 
     def __post_init__(self) -> None:
         what = f"P({self.name} | S)"
@@ -169,10 +169,10 @@ class Model:
     prior: NDArray[np.float64] | None = None
     """P(S), float64[lines] summing to 1.
 
-    None means a uniform prior. With `prior_select`, None means the mean of the rows of the prior table.
+    None means a uniform prior. With `prior_select`, None means the mean of the rows of its table.
     """
     prior_select: PriorSelect | None = None
-    """The variable that selects the prior, or None. With a variable, `prior` applies while its reading is missing."""
+    """The variable that selects the prior, or None. `prior` applies while the reading of this variable is missing."""
     transition: Transition | None = None
     """The transition of the searched variable between frames, or None without a filter.
 
@@ -236,7 +236,7 @@ class Model:
         )
 
     def with_bits(self, bits: Mapping[str, int]) -> Self:
-        """Return the model with these numbers of address bits, by the variable's name, or raise a ModelError."""
+        """Return the model with the numbers of address bits in `bits`, by variable name, or raise a ModelError."""
         select = self.prior_select
         return replace(
             self,
@@ -263,7 +263,7 @@ class Model:
 
     @property
     def variables(self) -> tuple[Variable, ...]:
-        """All known variables as entries of `deployment.toml`, the columns first, then the selection of the prior."""
+        """The `deployment.toml` entries of all known variables. The variable that selects the prior comes last."""
         return tuple(known.as_variable() for known in self._all_known())
 
     @property
@@ -302,7 +302,7 @@ def dimension(
 
 
 def cell_centres(*searched: Dimension) -> tuple[NDArray[np.float64], ...]:
-    """Return the centres of the cells of all lines: the values of each dimension, as float64[lines] per dimension."""
+    """Return for each dimension its values at the centres of all cells: float64[lines]."""
     check_size("the grid of cells", math.prod(each.size for each in searched), MAX_LINES)
     axes = [d.offset + np.arange(d.size) * d.step for d in searched]
     return tuple(axis.ravel() for axis in np.meshgrid(*axes, indexing="ij"))

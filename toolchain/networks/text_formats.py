@@ -112,7 +112,7 @@ class Scanner:
         return int(word)
 
     def numbers(self, end: str, wanted: int, what: str, *, between: str = ",") -> NDArray[np.float64]:
-        """Consume and return numbers up to the sign `end`: float64[wanted]. Signs in `between` separate numbers, too."""
+        """Consume and return numbers up to the sign `end`: float64[wanted]. Signs in `between` count as spaces."""
         stop = self._text.find(end, self._end)
         if stop < 0:
             self._start = self._end = len(self._text)
