@@ -50,7 +50,7 @@ class BM1Kind(MachineKind):
     }
 
     def due_sections(self, parameters: BM1Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-        """Yield the sections of a file: the prior, any tables of columns (MIFs in the thesis) and of random numbers."""
+        """Yield the sections of a file: the prior, any column tables (MIFs in the thesis), any random numbers."""
         yield "prior", "<u2", (parameters.prior_addresses, parameters.lines)
         if parameters.has_tables:
             for column, bits in enumerate(parameters.sensor_bits, start=1):

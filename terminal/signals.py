@@ -37,8 +37,8 @@ def raise_on_signals() -> None:
     A second signal is ignored, because the clean-up after the first signal always ends within a limited time.
 
     Before code blocks, it must call `check_signals`, as `run_async` does, because the exception can be lost. Python
-    drops it while the thread runs a callback from C code, forks, or runs a finaliser. C code may print it and raise
-    another exception, as numba does while it is imported.
+    drops the exception while the thread runs a callback from C code, forks, or runs a finaliser. C code may print the
+    exception and raise another exception, as numba does while it is imported.
     """
     sys.unraisablehook = _report_dropped
     sys.excepthook = _report_printed

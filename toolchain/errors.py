@@ -59,7 +59,7 @@ class DeploymentVersionError(DeploymentError):
 
 
 class DamagedDeploymentError(DeploymentError):
-    """A file of the deployment has changed since the build: its hash differs from the recorded hash."""
+    """A file of the deployment has changed since the build: the hash of the file differs from the recorded hash."""
 
 
 class ReadingError(ToolchainError):
