@@ -84,7 +84,7 @@ class AccessRefusedError(UsageError):
 
 
 class DisconnectedError(BridgeError):
-    """Raised when there is no connection, or when it was lost while the caller waited."""
+    """Raised when there is no connection, or when the connection was lost while the caller waited."""
 
 
 class StateTimeoutError(BridgeError):

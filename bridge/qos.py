@@ -1,7 +1,7 @@
 """Quality of service of a ROS 2 topic, for the field `qos` of `advertise` and `subscribe`.
 
 Newer ROS 2 servers read the field. Older ROS 2 servers and ROS 1 servers silently ignore it. The server chooses the
-values of omitted settings. For a subscription, its choice depends on the topic's publishers.
+values of omitted settings. For a subscription, the choice depends on the topic's publishers.
 """
 
 import math

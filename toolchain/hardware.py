@@ -40,7 +40,7 @@ def run_tool(
     *,
     separate: bool = False,
 ) -> str:
-    """Run a tool in a folder and return its output, or raise a HardwareToolError. `separate` omits standard error."""
+    """Run a tool in a folder. Return its output, or only stdout if `separate`, or raise a HardwareToolError."""
     if missing(command[:1]):
         raise HardwareToolError(f"{command[0]} is not installed (Debian: apt-get install {command[0]})")
     try:
@@ -85,7 +85,7 @@ PARAMETERS: Final = "bm1_parameters.vhd"
 
 
 def in_order(sources: Sequence[Path | str], parameters: Path | str = PARAMETERS) -> list[str]:
-    """Return VHDL files in the order of analysis: the first of `sources`, the package of parameters, the others."""
+    """Return VHDL files in the order of analysis: the first source, the package of parameters, the other sources."""
     return [str(sources[0]), str(parameters), *map(str, sources[1:])]
 
 
@@ -199,7 +199,7 @@ class Compiled:
 
 
 def check_tools(simulator: Simulator) -> None:
-    """Raise a HardwareToolError if a program of the simulator or the VHDL is not installed."""
+    """Raise a HardwareToolError if the VHDL or a program of the simulator is not installed."""
     absent = missing(simulator.tools)
     if absent:
         raise HardwareToolError(

@@ -76,7 +76,7 @@ class Connection:
             self.send(greeting)
 
     def receive(self) -> bool:
-        """Receive once, and return whether bytes arrived. If the connection is closed, `open` becomes False."""
+        """Read once, and return whether bytes arrived. If the connection is closed, `open` becomes False."""
         try:
             count = self.socket.recv_into(self.decoder.room(), 0, socket.MSG_DONTWAIT)
         except BlockingIOError:

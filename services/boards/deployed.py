@@ -21,7 +21,7 @@ TICK = 0.2
 class DeployedBoards:
     """The boards of a deployment. A restarted board is programmed and opened again.
 
-    Only one thread at a time may call the methods. `status` is the exception.
+    Any thread may call `status`. Only one thread at a time may call the other methods.
     """
 
     def __init__(

@@ -23,8 +23,8 @@ def report_of(
 ) -> FrameReport:
     """Return the report of a frame.
 
-    `now` is the present time in ns, as (Unix time, monotonic time). `previous_out_ns` is the duration in ns of sending
-    the previous result.
+    `now` is the present time in ns, as (Unix time, monotonic time). `previous_out_ns` is the time
+    in ns that it took to send the previous result.
     """
     result = publish.result
     sent_ns, tick = now

@@ -74,7 +74,7 @@ class Link(Protocol):
 
 
 MakeLink = Callable[[Callable[[AnyRecord], None]], Link]
-"""Function that creates a service's link. The link passes the records that follow a master's hello to the argument."""
+"""Function that creates a service's link. Its argument is called with each record after a master's hello."""
 
 
 class MasterLink(Link):
@@ -276,7 +276,7 @@ async def report_failure(link: Link, error: BaseException) -> None:
 
 
 def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None:
-    """Return an error that advises a restart, or None if the folder lacks the deployment that the hello requires."""
+    """If the folder now has the deployment of the `refused` hello, return an error that advises a restart, else None."""
     if not isinstance(refused, Hello) or refused.deployment_hash == deployment.hash:
         return None
     try:

@@ -156,7 +156,7 @@ class ExactChain:
         return np.asarray(np.linalg.inv(np.eye(len(self.law)) - self.sweep + self.law))
 
     def effective(self) -> NDArray[np.float64]:
-        """Return the number of independent samples that equal one sweep, for each searched value: float64[values]."""
+        """Return the number of independent samples equivalent to a sweep, for each searched value: float64[values]."""
         places = np.arange(len(self.posterior(self.law)))
         values = (self._searched[:, np.newaxis] == places).astype(np.float64)
         centred = values - self.law @ values

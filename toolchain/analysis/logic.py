@@ -169,7 +169,7 @@ class Logic:
 
 
 def state_bits(p: BM1Parameters | BM2Parameters, table_length: int) -> int:
-    """Return the width of a generator's state in bits. The state is an LFSR, or an index in a table of numbers."""
+    """Return the number of bits in a generator's state: an LFSR, or an index in the table of random numbers."""
     return p.rng.lfsr_bits or _index_bits(table_length)
 
 
@@ -245,7 +245,7 @@ def _index_bits(count: int) -> int:
 MLAB_ALMS: Final = 10
 """Number of ALMs of a memory LAB."""
 MLAB_SHAPE: Final = (64, 10)
-"""Number of words and bits per word of a memory LAB. Of the two possible shapes, this is the deeper."""
+"""Number of words and bits per word of a memory LAB. Of its two shapes, this is the deeper one."""
 MLAB_SHARE: Final = 0.5
 """Share of the LABs in a Stratix V that can be used as memories."""
 
@@ -254,7 +254,7 @@ BLOCK_SHAPES: Final = ((512, 40), (1024, 20), (2048, 10), (4096, 5), (8192, 2), 
 
 
 def blocks_of(words: int, width: int) -> int:
-    """Return the minimum number of M20Ks that hold `words` words of `width` bits."""
+    """Return the minimum number of M20Ks for a table with these numbers of words and of bits per word."""
     return min(math.ceil(words / deep) * math.ceil(width / wide) for deep, wide in BLOCK_SHAPES)
 
 
@@ -274,7 +274,7 @@ class EqualMemories:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Memories:
-    """The memories of a machine. `logic_tables` tables are in memory LABs because no memory block was left for them."""
+    """The memories of a machine. `logic_tables` counts the tables in memory LABs, for which no block was left."""
 
     table_bits: int
     blocks: int
@@ -321,7 +321,7 @@ def word_memories_of(p: BM1Parameters, inputs: int = 0) -> list[EqualMemories]:
 def place_memories(
     parameters: BM1Parameters, device: Device, table_length: int = LENGTH, inputs: int = 0
 ) -> Memories:
-    """Place tables in the M20Ks that other memories leave free, the deepest first. The rest are in memory LABs."""
+    """Place tables in the M20Ks that other memories leave free, the deepest first. The others go into memory LABs."""
     tables = tables_of(parameters)
     room = math.floor(device.usable * device.blocks)
     others = random_memories_of(parameters, table_length) + word_memories_of(parameters, inputs)

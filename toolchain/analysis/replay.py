@@ -171,14 +171,14 @@ class PartFile:
         self.there[row] = 1
 
     def earlier(self, row: int) -> tuple[_Posterior, int] | None:
-        """Return the posterior, if any, and the cycles of a row, or None if the file lacks the row's record."""
+        """Return a row's posterior, if there is any, and cycles. Return None if the file lacks the row's record."""
         if not self.there[row]:
             return None
         posterior: NDArray[np.float64] = np.array(self.records[row]["posterior"])
         return None if math.isnan(posterior[0]) else posterior, int(self.records[row]["cycles"])
 
     def ready(self) -> Iterator[NDArray[np.void]]:
-        """Yield new batches of records in the order of the rows, up to the first row without a record."""
+        """Yield batches of records that it has not yielded, in the order of the rows, up to the first absent record."""
         rows = len(self.records)
         gap = self.there.find(0, self.written) % (rows + 1)  # -1, for none, becomes the number of rows
         while self.written + _TOGETHER <= gap or self.written < gap == rows:

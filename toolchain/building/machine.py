@@ -31,7 +31,7 @@ MACHINE_KEYS: Final = tuple(
 )
 """Keys of `[machine]` that are also fields of BM1Parameters, except `lines`.
 
-In `[machine]`, `lines` counts the lines of all boards.
+In `[machine]`, the key `lines` counts the lines of all boards.
 """
 
 
@@ -179,7 +179,7 @@ class LineBlock:
 
 
 def partition_lines(lines: int, count: int) -> tuple[LineBlock, ...]:
-    """Divide lines in order among `count` boards, or raise a BuildError. The first boards may get one more line."""
+    """Divide lines in order among `count` boards, or raise a BuildError. The first boards may have one line more."""
     if not 1 <= count <= lines:
         raise BuildError(
             f"{lines} lines cannot be divided among {count} boards: expected 1 to {lines} partitions"

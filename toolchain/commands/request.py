@@ -115,7 +115,7 @@ class BuildFlags(MachineOptions, ModelFlags):
 
 
 def model_file(path: Path) -> Path:
-    """Return the file that defines a model: a network file or a folder's `model.py`. Raises a ToolchainError."""
+    """Return a model's network file or a folder's `model.py`, or raise a ToolchainError if the file is missing."""
     if is_network(path):
         open_regular(path, NetworkFileError).close()
         return path
@@ -125,7 +125,7 @@ def model_file(path: Path) -> Path:
 
 
 def read_source(path: Path, flags: ModelFlags) -> "Model | Question":
-    """Return the model or question of a folder's `model.py`. For a network file, return the question in the flags."""
+    """Read the model or question in a folder's `model.py`, or the question that the flags ask about a network file."""
     settings = key_values(flags.settings or ())
     return (_network_question if is_network(path) else _case_source)(path, flags, settings)
 
@@ -170,7 +170,7 @@ def _case_source(path: Path, flags: ModelFlags, settings: dict[str, str]) -> "Mo
 def build_options(
     flags: BuildFlags, target: TargetOptions, sources: Path | None = None, *, is_checked: bool = False
 ) -> BuildOptions:
-    """Return the options of a build. Several topics stand in the file `sources` and not in the flags.
+    """Return the options of a build. For several topics, the file `sources` replaces the flags of a topic.
 
     With `is_checked`, the flags that name the topic of the readings may be missing.
     """
@@ -210,7 +210,7 @@ def build_options(
 
 
 def fit_to_device(plan: "MachinePlan", name: str | None) -> tuple["MachinePlan", str]:
-    """Return the plan with enough boards of the device, and the reasons. `--replicas fill` makes each board full."""
+    """Return the plan with enough boards of the device, and the reasons. With `--replicas fill`, fill each board."""
     if name is None:
         return plan, ""
     from toolchain.analysis.logic import device_named

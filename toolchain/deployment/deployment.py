@@ -192,7 +192,7 @@ class Deployment(DeploymentFile):
         return self.directory / self.boards[board].image
 
     def new_filter(self) -> "Filter | None":
-        """Return a new filter from the file in `[filter]`, or None without this section. May raise a DeploymentError."""
+        """Return the filter in the file of `[filter]`, or None without this section. May raise a DeploymentError."""
         if self.filter is None:
             return None
         # here, because a subscriber loads a deployment without NumPy
@@ -203,7 +203,7 @@ class Deployment(DeploymentFile):
 
     @property
     def edited_boards(self) -> tuple[int, ...]:
-        """The boards whose images come from MIFs or parameters edited by hand. They may differ from the model."""
+        """The boards with images from MIFs or parameters edited by hand. These images may differ from the model."""
         return tuple(index for index, board in enumerate(self.boards) if board.built_hash)
 
     def output_uri(self, output: Output) -> str:

@@ -34,7 +34,7 @@ def normal_table(name: str, shape: Normal, *, values: int, offset: float, step: 
 def wrapped_normal_table(
     name: str, shape: Normal, *, values: int, offset: float, step: float
 ) -> NDArray[np.float64]:
-    """Return P(K | S) for wrapped normals, float64[values, lines]. Together, the `values` bins are one turn."""
+    """Return P(K | S) for wrapped normals, float64[values, lines]. Together, all bins cover one turn."""
     mean, sigma = _checked(name, shape, values, step)
     turn = values * step
     sigma = np.minimum(sigma, _UNIFORM * turn)
@@ -100,7 +100,7 @@ def _mass(
 
 
 def middle_bin(bin_in_sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the probability of the bin at a normal's mean. `bin_in_sigmas` is the width of the bin over sigma."""
+    """Return a normal's probability of a bin centred at the mean. `bin_in_sigmas` is the bin's width over sigma."""
     return 1 - 2 * _upper_tail(bin_in_sigmas / 2)
 
 
