@@ -40,7 +40,7 @@ def run_tool(
     *,
     separate: bool = False,
 ) -> str:
-    """Run a tool in a folder. Return its output, or only stdout if `separate`, or raise a HardwareToolError."""
+    """Run a tool in a folder, or raise a HardwareToolError. Return its output; with `separate`, omit standard error."""
     if missing(command[:1]):
         raise HardwareToolError(f"{command[0]} is not installed (Debian: apt-get install {command[0]})")
     try:

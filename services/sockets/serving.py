@@ -276,7 +276,7 @@ async def report_failure(link: Link, error: BaseException) -> None:
 
 
 def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None:
-    """If the folder now has the deployment of the `refused` hello, return an error that advises a restart, else None."""
+    """If the folder has the deployment of the `refused` hello, return an error that advises a restart, else None."""
     if not isinstance(refused, Hello) or refused.deployment_hash == deployment.hash:
         return None
     try:
