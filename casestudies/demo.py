@@ -57,7 +57,7 @@ class Case:
 
 
 def boat(rates: Sequence[str], clock: float, *, array: bool) -> Case:
-    """Return the boat on four boards. With `array`, the readings are published as std_msgs/Float64MultiArray."""
+    """Return the boat on four boards. With `array`, the readings are std_msgs/Float64MultiArray."""
     flags = ["--array"] if array else []
     return Case(
         name="boat",
@@ -90,7 +90,7 @@ def sprinkler(rates: Sequence[str], count: int) -> Case:
 
 
 def disparity(rates: Sequence[str]) -> Case:
-    """Return binocular disparity on one board. The board has a replica of the machine for each of 160 pixels."""
+    """Return binocular disparity on one board, with a replica of the machine for each of 160 pixels."""
     options = {"sensor-mode": "threshold", "replicas": 160, "queue": "all", "max-cycles": 8192}
     return Case(
         name="disparity",

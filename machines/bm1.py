@@ -16,7 +16,7 @@ _Scalar = TypeVar("_Scalar", bound=np.generic)
 
 
 class MachineContents:
-    """Parameters and tables of a machine. Two objects are equal if their parameters and tables are equal."""
+    """Parameters and tables of a machine. Objects with equal parameters and tables are equal."""
 
     __slots__: tuple[str, ...] = ()
     parameters: Any
@@ -119,7 +119,7 @@ class StopReason(IntEnum):
     OVERFLOW = 1
     """A counter reached the target count."""
     MAX_CYCLES = 2
-    """The machine ran to the frame's last cycle (`max_cycles`), and no counter reached the target count."""
+    """The machine ran to the frame's last cycle without an overflow."""
     SLICE = 3
     """The machine ran to the slice's last cycle (`run_until`). The frame can continue."""
     IMPOSSIBLE = 4
@@ -131,10 +131,10 @@ _SLICE: Final = StopReason.SLICE
 
 
 def joint_reason(reasons: Sequence[StopReason], halted: Collection[int] = ()) -> StopReason:
-    """Return the common stop reason of several replicas. `halted` are the replicas that must not continue.
+    """Return one stop reason for several replicas.
 
-    If a replica that is not in `halted` stopped at its slice's end, the reason is `SLICE`. Otherwise it is the first
-    of `OVERFLOW`, `MAX_CYCLES` and `IMPOSSIBLE` that any replica has, or `NONE`.
+    If a replica that is not in `halted` can continue, the reason is `SLICE`. Otherwise it is the first of `OVERFLOW`,
+    `MAX_CYCLES` and `IMPOSSIBLE` that any replica has.
     """
     if _SLICE in reasons and any(
         reason is _SLICE and replica not in halted for replica, reason in enumerate(reasons)
@@ -239,7 +239,7 @@ def checked_rng_table(given: npt.NDArray[np.uint32] | None, rng: RngKind) -> npt
 
 
 def frozen(array: npt.NDArray[_Scalar]) -> npt.NDArray[_Scalar]:
-    """Return a read-only C-contiguous copy, or the array itself if it is already read-only and C-contiguous."""
+    """Return a read-only C-contiguous array: `array` itself if possible, otherwise a copy."""
     if array.flags.c_contiguous and array.flags.owndata and not array.flags.writeable:
         return array
     copy = array.copy(order="C")

@@ -1,7 +1,7 @@
 """Vectors of 512 bits in code compiled by numba: their type, their operators, and functions written as LLVM code.
 
 Hot loops use these vectors, because numba does not vectorise a loop over only 8 words. Without vectors, the loops were
-2.5 times slower. Vectors work on any processor. They are local variables, and are not passed to compiled functions.
+2.5 times slower. Vectors work on any processor, but only as local variables.
 """
 
 import math

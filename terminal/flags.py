@@ -43,7 +43,7 @@ def field_flag(model: type[BaseModel], name: str) -> Flag:
 
 
 def default_of(model: type[BaseModel], name: str) -> str:
-    """Return the default of a model's field as text for the help, or "" if the field has no default."""
+    """Return the default of a model's field as text, or "" if there is none."""
     default = model.model_fields[name].default
     return field_flag(model, name).otherwise or ("" if default in (None, False, ()) else str(default))
 

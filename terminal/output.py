@@ -1,4 +1,4 @@
-"""Output on standard output and standard error: text lines for people, and JSON lines for programs."""
+"""Standard output and standard error: text lines for people, JSON lines for programs."""
 
 import contextlib
 import json
@@ -71,7 +71,7 @@ def say_lines(text: str) -> None:
 
 
 def relay(line: str, process: str) -> None:
-    """Print a line from the standard error of a child process on the standard error of this process."""
+    """Print a line from a child's standard error on the standard error of this process."""
     write_line(relayed(line, process))
 
 
@@ -99,7 +99,7 @@ def open_standard_streams() -> None:
 
 
 def discard_output() -> None:
-    """Redirect standard output to /dev/null after a failed write, so that flushing it at exit does not fail too."""
+    """Redirect standard output to /dev/null after a failed write, so that flushing at exit cannot fail."""
     with contextlib.suppress(OSError), Path(os.devnull).open("wb") as null:
         os.dup2(null.fileno(), sys.stdout.fileno())
 

@@ -32,7 +32,7 @@ _ConnectionT = TypeVar("_ConnectionT", bound=asyncio.Protocol)
 
 
 def shown(uri: str) -> str:
-    """Return a URI without user and password, and with `***` instead of the query."""
+    """Return a URI without user and password, with `***` for the query."""
     return _QUERY.sub("?***", _CREDENTIALS.sub(r"\1", uri))
 
 

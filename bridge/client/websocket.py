@@ -77,7 +77,7 @@ def check_uri(uri: str) -> WebSocketURI:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limits:
-    """Limits of a connection (see `bridge.client.connect`). `max_size` is in bytes, and all times are in seconds."""
+    """Limits of a connection (see `bridge.client.connect`): times in seconds, and `max_size` in bytes."""
 
     connect_timeout: float
     max_size: int
@@ -139,7 +139,7 @@ class WebSocket(WebSocketTransport):
         self._silent_for = 0.0
 
     async def handshake(self, headers: tuple[tuple[str, str], ...]) -> None:
-        """Perform the opening handshake with additional `headers`. If the handshake fails, raise its error."""
+        """Perform the opening handshake, or raise the error that ended it."""
         request = self._client_protocol.connect()
         request.headers.update(headers)
         request.headers.setdefault("User-Agent", USER_AGENT)
@@ -272,15 +272,15 @@ async def open_websocket(
     on_messages: Callable[[list[bytes]], None],
     on_lost: Callable[[WebSocket, str], None],
 ) -> WebSocket:
-    """Open a connection without compression. On a local network, compression costs more time than it saves.
+    """Open a connection without compression. On a local network, compression costs more than it saves.
 
     `shown_uri` is the URI without secrets, for errors. `on_messages` is called with a list of messages that arrived
-    together. When the connection ends, `on_lost` is called once with the reason.
+    together. `on_lost` is called once, with the reason of the end.
 
     Raises:
         UnreachableError: No server answers, it accepts no more clients, or its certificate is not trusted.
         NotRosbridgeError: A server answers, but not as a WebSocket server.
-        AccessRefusedError: The token or certificate of this client is missing or wrong.
+        AccessRefusedError: The token or client certificate is missing or wrong.
     """
     attempt: WebSocket | None = None
 

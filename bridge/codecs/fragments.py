@@ -27,7 +27,7 @@ from bridge.codecs.json_codec import MAX_SIZE
 from bridge.errors import DecodeError
 
 MAX_SETS: Final = 16
-"""Maximum number of incomplete messages of a connection. A further message replaces the oldest."""
+"""Maximum number of incomplete messages. A further message replaces the oldest."""
 MAX_FRAGMENTS: Final = 1 << 16
 """Maximum number of fragments in a message."""
 MAX_AGE: Final = 10.0
@@ -126,7 +126,7 @@ class Reassembler:
         return None
 
     def expire(self, now: float) -> None:
-        """Discard each message that has not received a fragment for `MAX_AGE` seconds at the time `now`."""
+        """Discard each message that has not received a fragment for `MAX_AGE` seconds."""
         for key in [key for key, begun in self._sets.items() if begun.touched + MAX_AGE <= now]:
             self._forget(key)
 
@@ -158,7 +158,7 @@ class Reassembler:
 def split(message: bytes, fragment_size: int, fragment_id: FragmentId) -> Iterator[bytes]:
     """Split the JSON of an operation into fragments.
 
-    Each fragment contains at most `fragment_size` bytes of the JSON. Only a single character may be longer.
+    A fragment contains at most `fragment_size` bytes of the JSON, or one longer character.
 
     Yields:
         The message itself if it fits into one fragment. Otherwise the fragments as JSON, numbered from 0.

@@ -31,7 +31,7 @@ _Absent = tuple[dict[str, Any], bytes, _Parts]
 
 
 class Filler:
-    """The fields of one message type with their defaults, for filling absent fields of messages."""
+    """The fields of one message type, and the defaults for absent fields."""
 
     def __init__(
         self,

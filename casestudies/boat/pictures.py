@@ -27,7 +27,7 @@ class StageKind(StrEnum):
 
 
 THESIS_SHARES: Final = {StageKind.ROSBRIDGE: 0.9874, StageKind.COMPUTING: 0.0124, StageKind.REGISTERS: 0.0001}
-"""The share of each kind of stage in a frame's time, as the thesis reports it (4.3)."""
+"""Shares of a frame's time for each kind of stage, as in the thesis (4.3)."""
 PCIE: Final = "pcie-gen2"
 
 
@@ -203,8 +203,8 @@ def draw_shares(
 ) -> None:
     """Draw figure 4.5: the mean time of each stage, and its share of a frame's time.
 
-    `note` is written below the axis. The legend shows the share of each kind of stage. For the kinds in `beside`, the
-    legend also shows the thesis's share. Raises an OutputError if the file cannot be written.
+    `note` is written below the axis. The legend shows the share of each kind of stage and, if it is in
+    `beside`, the thesis's share. Raises an OutputError if the file cannot be written.
     """
     figure = new_figure(8.4, 1.5 + 0.42 * max(len(shares), 1))
     axes = figure.subplots()

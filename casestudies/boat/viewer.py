@@ -163,7 +163,7 @@ class BoatViewer:
                     warn(f"frames on /bm/frame without their result: {listener.announced_only}")
 
     def draw(self, folder: Path) -> tuple[Path, ...]:
-        """Write the pictures into `folder` and return their paths. Raises an OutputError if that fails."""
+        """Write the pictures into `folder` and return their paths, or raise an OutputError."""
         from casestudies.boat.pictures import (
             PCIE,
             THESIS_SHARES,

@@ -22,7 +22,7 @@ _WAITING: Final = 16
 
 
 class BadImageError(Exception):
-    """A message is not a usable image, for example because of its encoding or because it has no stamp."""
+    """A message is not a usable image, for example because it has no stamp."""
 
 
 def read_image(message: Mapping[str, Any], *encodings: str) -> NDArray[Any]:
@@ -58,7 +58,7 @@ def read_image(message: Mapping[str, Any], *encodings: str) -> NDArray[Any]:
 def image_message(
     image: NDArray[Any], head: Mapping[str, Any], encoding: Literal["mono8", "32FC1"]
 ) -> dict[str, Any]:
-    """Return pixels, an array [height, width], as a sensor_msgs/Image with the header `head`."""
+    """Return pixels [height, width] as a sensor_msgs/Image with the header `head`."""
     pixels = np.ascontiguousarray(image, dtype=np.dtype(_DTYPES[encoding]).newbyteorder("<"))
     height, width = pixels.shape
     return {

@@ -33,7 +33,7 @@ from pcie_shim.host.socket_link import LONGEST_POLL_S
 from pcie_shim.programming_file import Image
 
 SLACK_S: Final = 5.0
-"""Default of `slack`: seconds that a frame may take in addition to its cycles at the boards' measured speed."""
+"""Default of `slack`: seconds that a frame may take in addition to the time for its cycles."""
 FIRST_WAIT_S: Final = 0.01
 """Maximum number of seconds for which `collect` polls only the board that was started last."""
 PROGRAMMING_S: Final = 30.0
@@ -95,7 +95,7 @@ class MiniCluster:
     """All boards of a deployment, in the order of the partition. Only one thread may use a MiniCluster."""
 
     def __init__(self, boards: Sequence[DrivenBoard], *, timeout: float, slack: float) -> None:
-        """Store the boards without connecting. Call `open` instead, which also connects."""
+        """Store the boards without connecting. Use `open`, which also connects."""
         self._boards = tuple(boards)
         first = self._boards[0].image
         self._machines = first.kind.on_host([board.image.machine for board in self._boards])
@@ -215,10 +215,10 @@ class MiniCluster:
             raise
 
     def collect(self, seconds: float) -> FrameOutput | None:
-        """Receive the boards' answers to the posted frame. If all boards have answered, start the next slice, if any.
+        """Receive the answers to the posted frame. After the last answer, start the next slice, if any.
 
-        `collect` waits for answers for at most `seconds`. It returns the result of the frame, or None if boards are
-        still running. In this case, poll the descriptor `awaited` before the next call. Raises the errors of `run`.
+        `collect` waits for at most `seconds`. It returns the frame's result, or None if boards are still running. In
+        this case, poll `awaited` before the next call. Raises the errors of `run`.
         """
         progress = self._progress
         if progress is None:
@@ -245,7 +245,7 @@ class MiniCluster:
 
     @property
     def seconds_left(self) -> float:
-        """Seconds until the deadline of the running slice, or 0 without a frame. Call `collect` before the deadline."""
+        """Seconds until the deadline of the running slice, or 0 without a frame."""
         return 0.0 if self._progress is None else max(0.0, self._progress.deadline - time.monotonic())
 
     def _expect_done(self, progress: _Progress) -> None:

@@ -40,7 +40,7 @@ class ResultFile(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Write the frames that are not yet in the file. No frame may be added after `close`."""
+        """Write the frames that are not yet in the file. No frame may follow."""
 
     def _error(self, why: str | OSError) -> SettingsError:
         if isinstance(why, OSError):

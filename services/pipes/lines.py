@@ -52,7 +52,7 @@ class LineResult(msgspec.Struct, kw_only=True):
 
 
 def require_pipe(command: str, values: str) -> None:
-    """Raise a SettingsError if standard input is a terminal. `values` names what the command would read."""
+    """Raise a SettingsError if standard input is a terminal."""
     if sys.stdin.isatty():
         raise SettingsError(
             f"{command} reads {values} from standard input, which is a terminal: pipe them in, or use --listen ({command} --help)"

@@ -115,7 +115,7 @@ class Report:
         self._samples: deque[tuple[float, float, int]] = deque(maxlen=_SAMPLES)
 
     def sample(self, manager: ServiceManager) -> None:
-        """Record the CPU time and the number of frames for the rates, and report to the service manager."""
+        """Record CPU time and frames for the rates, and report to the service manager."""
         # not `status`, which would read /proc every second
         status = self._get_status()
         completed = status.frames.completed if status.frames is not None else 0
@@ -123,7 +123,7 @@ class Report:
         manager.report(status.why, ready=status.ready, alive=self._is_alive())
 
     def status(self) -> ProcessStatus:
-        """Return the status from `get_status`, completed with the values that every process reports."""
+        """Return the status of `get_status` with the values that every process reports."""
         status, now, cpu_s = self._get_status(), time.monotonic(), time.process_time()
         alive = self._is_alive()
         frames = status.frames

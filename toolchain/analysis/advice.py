@@ -129,8 +129,8 @@ def advise(
 ) -> Advice:
     """Compare a BM1, a BM2 and exact inference for a model or a question.
 
-    At the start of each run, `begun` is called with a description of the run. Raises a ToolchainError if exact
-    inference is impossible.
+    `begun` is called at the start of each run, with a text about the run. Raises a ToolchainError if exact inference
+    is impossible.
     """
     device = device_named(options.device)
     network = network_for(source)

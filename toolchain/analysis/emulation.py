@@ -17,8 +17,8 @@ from toolchain.deployment import Stop
 from toolchain.errors import BuildError
 
 Inputs: TypeAlias = "tuple[int, ...] | NDArray[np.int64]"
-"""Inputs of a frame: for each sensor column, the address of the reading in the column's table. If each line has its
-own readings, the inputs are an array int64[sensors, lines of all boards]."""
+"""Inputs of a frame: one address per sensor column, or int64[sensors, lines of all boards] if each line has its own
+readings."""
 WrittenPrior: TypeAlias = "NDArray[np.uint16] | None"
 """Codes of a prior that the host writes for a frame, uint16[lines of all boards]. None selects the machines' prior."""
 
@@ -84,10 +84,9 @@ class EmulatedBoards:
         return self.machines[0].parameters
 
     def parts(self, inputs: Inputs, prior: WrittenPrior) -> Iterator[tuple[Inputs, WrittenPrior]]:
-        """Return a pair for each board: the board's inputs of a frame, and its part of the written prior.
+        """Return a pair for each board: its inputs of a frame, and its part of the written prior or None.
 
         If each line has its own readings, the inputs are split among the boards. Otherwise each board gets all inputs.
-        If `prior` is None, the part is None.
         """
         count, ends = len(self.machines), self._ends
         of_boards = [inputs] * count if isinstance(inputs, tuple) else np.split(inputs, ends, axis=1)
@@ -161,7 +160,7 @@ def addressed_chances(
 
 
 def one_replica(machine: BM1Machine) -> BM1Machine:
-    """Return `machine` with a single replica. For equal inputs, its counts are those of any replica of `machine`."""
+    """Return `machine` with one replica instead of `replicas`."""
     return replace(machine, parameters=replace(machine.parameters, replicas=1))
 
 

@@ -197,7 +197,7 @@ class Symbol:
         return values
 
     def shown(self, at: int) -> str:
-        """Return the value with the index `at` as text: its label or its number."""
+        """Return the value with the index `at` as its label or number."""
         return self.type.labels[at] if self.type.labels else f"{self.values()[at]:g}"
 
     @property
@@ -217,7 +217,7 @@ class Symbol:
         }
 
     def dimension(self) -> Dimension:
-        """Return the symbol as a searched dimension, or raise a ModelError if it has too many values."""
+        """Return the symbol as a searched dimension, or raise a ModelError."""
         return dimension(
             self.name,
             size=self.size,

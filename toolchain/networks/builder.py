@@ -69,7 +69,7 @@ class NetworkBuilder:
             raise place.error(str(reason)) from None
 
     def variable(self, name: str, states: Sequence[str] | int, place: Place) -> None:
-        """Add a variable. `states` contains the names of its states, or is their number."""
+        """Add a variable. `states` are the names of its states, or their number."""
         if not 0 < len(name) <= MAX_NAME:
             raise place.error(f"a variable's name has {len(name)} characters, expected 1 to {MAX_NAME}")
         if not name.isprintable():
@@ -92,7 +92,7 @@ class NetworkBuilder:
             raise place.error(f"variable {name}: {reason}") from None
 
     def shape(self, scope: Sequence[str], place: Place) -> tuple[int, ...]:
-        """Return the shape of a table over the variables in `scope`, after checking the limits of tables."""
+        """Return the shape of a table over the variables in `scope`, after checking the limits."""
         if len(scope) > MAX_PARENTS + 1:
             raise place.error(f"a table of {len(scope)} variables; the maximum is {MAX_PARENTS + 1}")
         if len(set(scope)) < len(scope):
