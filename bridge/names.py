@@ -13,7 +13,7 @@ Kind = Literal["msg", "srv", "action"]
 RosVersion = Literal[1, 2]
 
 MAX_NAME = 255
-"""Maximum length of a name in characters. ROS 2 has this limit for the name of a topic."""
+"""Maximum length of a name in characters. ROS 2 has this limit for topics."""
 
 _TYPE = re.compile(r"([A-Za-z][A-Za-z0-9_]*)/(?:(msg|srv|action)/)?([A-Za-z][A-Za-z0-9_]*)")
 _TOPIC = re.compile(r"[~/]?[A-Za-z_][A-Za-z0-9_]*(?:/[A-Za-z_][A-Za-z0-9_]*)*")
@@ -73,7 +73,7 @@ def ros_version_of_type(name: str) -> RosVersion | None:
 
 
 def check_name(name: str) -> str:
-    """Return a valid name of a topic or service unchanged, or raise a NameFormError. Relative names are valid."""
+    """Return a valid name of a topic or service, or raise a NameFormError. Relative names are valid."""
     if len(name) > MAX_NAME:
         raise NameFormError(
             f"name {name[:40]!r}... has {len(name)} characters, at most {MAX_NAME} are allowed"
@@ -87,5 +87,5 @@ def check_name(name: str) -> str:
 
 
 def absolute(name: str) -> str:
-    """Return a name with a leading slash. The slash is added if the name has none."""
+    """Return a name, with a leading slash added if the name has none."""
     return name if name.startswith("/") else "/" + name

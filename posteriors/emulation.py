@@ -25,7 +25,7 @@ class EmulatedPosterior(Posterior):
 
     deployment: Deployment = field(compare=False)
     machines: tuple[Any, ...] = field(compare=False)
-    """The emulated machines of the boards. `exact` uses them, because the deployment's folder may change meanwhile."""
+    """The emulated machines of the boards. `exact` uses them, because the deployment's folder may change."""
     addresses: tuple[int | None, ...]
     """One address for each variable, in the order of the deployment. None stands for a missing reading."""
 

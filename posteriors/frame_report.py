@@ -57,11 +57,11 @@ class VariableReading(NamedTuple):
     """The reading of a variable in a frame."""
 
     value: Annotated[float | str, BeforeValidator(_number_or_text)]
-    """The received value, to nine digits. The name of a state is a text, and so is a number that is not finite."""
+    """The received value, to nine digits. Names of states and numbers that are not finite are texts."""
     address: int
     """Address in the variable's column."""
     age_ms: FiniteFloat
-    """Age of the variable's message in milliseconds when the report is sent, counted from the message's receipt."""
+    """Milliseconds since the receipt of the variable's message, when the report is sent."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,7 +103,7 @@ class FrameReport:
     def link_us(self, rate: str) -> float | None:
         """Return the modelled time in microseconds for all transfers of the frame, made one after another.
 
-        `rate` is a value of `--link-rate`. If the report has no bytes or no transfers, the result is None.
+        `rate` is a value of `--link-rate`. The result is None if the report has no bytes.
         """
         if self.link_bytes is None or self.link_transfers is None:
             return None

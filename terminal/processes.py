@@ -236,7 +236,7 @@ class Process:
             await self._news.wait()
 
     def failure(self, code: int) -> ProcessError:
-        """Return an error for the exit code of the process, with the last line that the process printed."""
+        """Return an error for the process's exit code, with the last line that the process printed."""
         said = self._lines[-1].removeprefix("error: ") if self._lines else "it said nothing"
         error = ProcessError(f"{self.name}: {said} (all that it said is in {self._log})")
         error.exit_code = code if code > 0 else ExitCode.CHILD

@@ -112,7 +112,7 @@ class TomlFile:
     text: str
     """Text of the file, for finding the line of a mistake."""
     tables: dict[str, Any]
-    """Tables of the file, before their validation."""
+    """Tables of the file, not yet validated."""
 
     @classmethod
     def read(cls, path: Path, error: type[ToolchainError]) -> Self:
@@ -224,7 +224,7 @@ def _split(place: Sequence[str | int]) -> tuple[str, int | None, str]:
 
 
 def nearest_name(word: str, known: Sequence[str], *, cutoff: float = 0.5) -> str:
-    """Return advice on a wrong name. It gives the nearest valid name or, if none is near, a list of valid names."""
+    """Return advice on a wrong name. It names the nearest valid name or, if none is near, valid names."""
     close = difflib.get_close_matches(word, known, n=1, cutoff=cutoff)
     if close:
         return f"did you mean '{close[0]}'?"

@@ -1,7 +1,7 @@
 """Limits of the hub, its errors, and the validation of the fields of an operation.
 
 If a field is invalid, the function that reads the field raises a `RefusedOperationError`. The broker logs the error.
-If the operation is a call or a goal, the broker also sends the error as the answer.
+For a call or a goal, the error is also the answer.
 """
 
 import re
@@ -127,7 +127,7 @@ def checked_name(name: str) -> str:
 
 
 def text(operation: Operation, field: str) -> str:
-    """Return the string in a required field of an operation. The string must not be empty."""
+    """Return the non-empty string in a required field of an operation."""
     value = operation.get(field)
     if not isinstance(value, str) or not value:
         raise RefusedOperationError(f"{field} of {operation['op']} must be a string")
@@ -135,12 +135,12 @@ def text(operation: Operation, field: str) -> str:
 
 
 def optional_text(operation: Operation, field: str) -> str | None:
-    """Return the string in a field, or None if the operation lacks the field. The string must not be empty."""
+    """Return the non-empty string in a field, or None if the field is absent."""
     return None if operation.get(field) is None else text(operation, field)
 
 
 def flag(operation: Operation, field: str) -> bool:
-    """Return the boolean in a field, or False if the operation lacks the field."""
+    """Return the boolean in a field, or False if the field is absent."""
     value = operation.get(field)
     if value is not None and not isinstance(value, bool):
         raise RefusedOperationError(f"{field} of {operation['op']} must be true or false")
@@ -148,7 +148,7 @@ def flag(operation: Operation, field: str) -> bool:
 
 
 def number(operation: Operation, field: str) -> float:
-    """Return the number in a field, or 0 if the operation lacks the field. The number must not be negative.
+    """Return the number in a field, or 0 if the field is absent. The number must not be negative.
 
     The reference server accepts only integers, and ignores an operation that contains `0.0`. The hub accepts `0.0`
     too, because no client wants its operations ignored.
@@ -172,7 +172,7 @@ def operation_id(operation: Operation) -> OperationId:
 
 
 def quality(operation: Operation) -> Operation:
-    """Return an operation's quality of service (`qos`), or an empty dictionary if the operation has none."""
+    """Return an operation's quality of service (`qos`), or {} if the operation has none."""
     value = operation.get("qos")
     if value is None:
         return {}

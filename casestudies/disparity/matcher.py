@@ -184,10 +184,7 @@ class Matcher:
             self._warn_once(f"an image on {message.topic} is skipped: {error}", message.topic)
 
     async def next_pair(self, limit_s: float) -> StereoImages:
-        """Return the newest pair that was not returned before. If there is none, wait for the next pair.
-
-        Raises a NoResultError if no pair comes within `limit_s` seconds.
-        """
+        """Return the newest pair not returned before, or wait for the next pair. Raises a NoResultError if none comes."""
         end = time.monotonic() + limit_s
         while self._newest is None:
             self._news.clear()
@@ -335,7 +332,7 @@ def disparity_matcher(
     """Turn stereo pairs into disparity images with a stack whose boards hold a machine for each pixel of a tile.
 
     Left and right images are paired by their stamps. A line for each pair compares the machines with float64 fusion.
-    If true disparities are published, the line also compares the machines and the fusion with the true disparities.
+    If true disparities are published, the line also compares both with the true disparities.
     """
     matcher = Matcher(disparities=disparities, pixels=pixels, clock=clock)
     if out is not None:

@@ -129,6 +129,6 @@ def result_record(number: int, output: FrameOutput) -> FrameResult:
 
 
 def frame_failed(number: int, error: BoardError) -> FrameFailed:
-    """Return a record that says that frame `number` failed because of a board's error."""
+    """Return a record that reports that frame `number` failed with a board's error."""
     reason = FailureReason.AWAY if isinstance(error, BoardAwayError) else FailureReason.FAILED
     return FrameFailed(number, error.board, exit_code_of(error), str(error), reason)

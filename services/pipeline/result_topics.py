@@ -109,10 +109,7 @@ class ResultTopics:
             self._watched = self._outputs[0][0].subscribe(output.topic, output.type, queue_size=RESULTS_DEPTH)
 
     async def seen(self, timeout: float) -> bool:
-        """Return whether a result published since `watch` comes back within `timeout` seconds.
-
-        If a result comes back, the subscription ends.
-        """
+        """Return whether a result published since `watch` comes back in time. If one does, stop watching."""
         if self._watched is None:
             return False
         # results of other publishers of the topic may arrive before

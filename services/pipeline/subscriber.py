@@ -46,8 +46,7 @@ _BACKLOG_LIMIT = min(1 << 18, MAX_RECORD)
 async def newest_message(subscription: Subscription, message: Message) -> tuple[Message, int]:
     """Skip old messages at the start of a subscription. Return the newest message, and how many were skipped.
 
-    `message` is the subscription's first message. A ROS 2 server first sends messages from before the subscription, in
-    one burst from the oldest to the newest.
+    `message` is the first message. A ROS 2 server begins with a burst of messages from before the subscription.
     """
     older = 0
     with contextlib.suppress(TimeoutError):

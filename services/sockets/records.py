@@ -33,7 +33,7 @@ VERSION = version("rosbayes")
 
 
 class LossReason(StrEnum):
-    """Reason why a reading has no result on some or all topics. `status` shows the reason."""
+    """Reason why a reading has no result on some or all topics, as `status` shows it."""
 
     PASSED_OVER = "passed over"
     """A newer reading replaced the reading (with `queue = latest`)."""
@@ -48,9 +48,9 @@ class LossReason(StrEnum):
     NO_POSTERIOR = "no posterior"
     ROSBRIDGE_AWAY = "rosbridge away"
     REFUSED = "refused by rosbridge"
-    """The server does not forward the topic. The topic has another type on the server, or is not allowed there."""
+    """The server does not forward the topic, because the topic has another type there or is not allowed."""
     SOME_TOPICS = "on some topics only"
-    """The result was published, but at least one server did not accept it or does not forward its topic."""
+    """The result was published, but not on the topics of every server."""
 
 
 class Outcome(StrEnum):
@@ -102,7 +102,7 @@ class Ready(Record, tag="ready", frozen=True):
 class Rosbridge(Record, tag="rosbridge", frozen=True):
     """The subscriber or publisher tells the master whether it is connected to a rosbridge server now.
 
-    If one of the two services is connected again, the master tells the other service, so that it reconnects at once.
+    If a service is connected again, the master tells the other service to reconnect at once.
     """
 
     connected: bool

@@ -86,8 +86,8 @@ def sample_readings(
 ) -> Readings:
     """Draw the true line of each frame, and then the frame's readings given this line.
 
-    If a variable selects the prior, all values of the variable are equally probable. With `in_sequence`, the line of a
-    frame is drawn given the line of the previous frame, if the model has a transition.
+    If a variable selects the prior, its values are equally probable. With `in_sequence`, the line of a frame is
+    drawn given the line of the previous frame, if the model has a transition.
     """
     check_frames(frames)
     random = np.random.default_rng(seed)

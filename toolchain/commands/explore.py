@@ -23,7 +23,7 @@ RESULTS = Path("build/explore.jsonl")
 def progress(total: int | None) -> Iterator[Callable[[str], None]]:
     """Show a progress bar if standard error is a terminal. Yield a function to call after each step.
 
-    The function takes a text to show beside the bar. If `total` is None, the bar does not show the share of done steps.
+    The function takes a text to show. Without a `total`, the bar does not show the share of done steps.
     """
     if not sys.stderr.isatty():
         yield lambda _: None

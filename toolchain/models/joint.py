@@ -274,7 +274,7 @@ class Question:
         )
 
     def refusal(self) -> NotFusionError | None:
-        """Return an error that says why the question is not naive fusion, or None if the question is naive fusion."""
+        """Return an error that says why the question is not naive fusion, or None if it is naive fusion."""
         observed = [symbol.name for symbol in self.observed]
         _, links = self._linked(self.joint.active, observed)
         if any(len(component.intersection(observed)) > 1 for component in links.components()):

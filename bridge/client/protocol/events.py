@@ -137,7 +137,7 @@ class GoalRequested:
 
 @dataclass(frozen=True, slots=True)
 class CancelRequested:
-    """The sender of a goal to an action of this client has cancelled the goal."""
+    """The sender of a goal has cancelled the goal."""
 
     action: str
     goal: str
