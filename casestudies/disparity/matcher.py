@@ -184,7 +184,7 @@ class Matcher:
             self._warn_once(f"an image on {message.topic} is skipped: {error}", message.topic)
 
     async def next_pair(self, limit_s: float) -> StereoImages:
-        """Return the newest pair not returned before, or wait for the next pair. Raises a NoResultError if none comes."""
+        """Return the newest pair not returned before, or wait for a pair. Raises a NoResultError if none comes."""
         end = time.monotonic() + limit_s
         while self._newest is None:
             self._news.clear()
