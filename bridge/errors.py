@@ -121,7 +121,7 @@ class GoalError(BridgeError):
     """Raised when an action refuses a goal, or the goal ends without a result.
 
     Attributes:
-        reason: Explanation from the server, or an empty text.
+        reason: Explanation from the server.
     """
 
     def __init__(self, reason: str, action: str) -> None:

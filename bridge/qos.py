@@ -1,7 +1,7 @@
 """Quality of service of a ROS 2 topic, for the field `qos` of `advertise` and `subscribe`.
 
-Newer ROS 2 servers read the field. Older ROS 2 servers and ROS 1 servers silently ignore it. The server chooses the
-values of omitted settings. For a subscription, the choice depends on the topic's publishers.
+Newer ROS 2 servers read the field, and other servers silently ignore it. The server chooses omitted settings. It
+adapts a subscription to the topic's publishers.
 """
 
 import math
@@ -51,7 +51,7 @@ class Qos:
                 raise OptionError(f"qos {name} must be a non-negative number of seconds, not {value!r}")
 
     def as_operation(self) -> dict[str, Any]:
-        """Return these settings as the value of the field `qos` in an operation."""
+        """Return the value for the field `qos` of an operation."""
         wanted: dict[str, Any] = {
             name: value
             for name in ("history", "depth", "reliability", "durability")

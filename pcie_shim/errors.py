@@ -86,7 +86,7 @@ class KeyRefusedError(LinkError):
 
 
 class GreetingMismatchError(LinkError):
-    """The board has another protocol version, register map or BAR size than this software."""
+    """The board has another protocol version, register map or BAR size than the host."""
 
     exit_code = 2
 

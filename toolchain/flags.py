@@ -96,7 +96,7 @@ def key_values(settings: Iterable[str], flag: str = "--set", example: str = "wid
 
 
 def names_in(flag: str, text: str) -> list[str]:
-    """Return the names in a text such as `A,B,C`. Raises a BuildError if a name is empty."""
+    """Return the names in `A,B,C`. Raises a BuildError if a name is empty."""
     names = [name.strip() for name in text.split(",")] if text else []
     if not all(names):
         raise BuildError(f"{flag} {text}: expected comma-separated names, such as {flag} A,B")

@@ -36,7 +36,7 @@ _LOG: Final = logging.getLogger(__name__)
 PROGRAMMING_SILENCE_S: Final = 10.0
 """If the loader sends no frame for this many seconds, another loader may program the board."""
 MAX_SILENT: Final = 16
-"""Maximum number of connections per port that have sent no request. A further connection replaces the oldest."""
+"""Maximum number of connections without a request per port. A further connection replaces the oldest."""
 
 _HELD: Final = "another host holds it; only one host can drive a board at a time"
 _PROGRAMMED: Final = "another loader is programming it"
@@ -103,7 +103,7 @@ class StopSignal:
         self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
 
     def set(self) -> None:
-        """Ask `serve_board` to end. A signal handler may call this method. Repeated calls do no harm."""
+        """Ask `serve_board` to end. A signal handler may call this method, also repeatedly."""
         with suppress(OSError):
             os.write(self._write, b"x")
 

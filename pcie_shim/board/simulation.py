@@ -40,7 +40,7 @@ class SimulatorAnswer(NamedTuple):
     clocks: int
     """Clocks that the request took."""
     words: bytes
-    """The words that were read, little-endian. If the hardware refused a word, only the earlier words are included."""
+    """The words that were read, little-endian. A refused word is not included."""
 
 
 class Simulation:
@@ -84,7 +84,7 @@ class Simulation:
         self.close()
 
     def close(self) -> None:
-        """End the child. If the child does not end within a second, kill it."""
+        """End the child. If it does not end within a second, kill it."""
         with contextlib.suppress(OSError):
             self._requests.close()
         try:
@@ -100,11 +100,11 @@ class Simulation:
         self._execute("z", 0, 0, 2, START_S)
 
     def run(self, clocks: int) -> SimulatorAnswer:
-        """Run the hardware until an interrupt, but at most for the given number of clocks."""
+        """Run until an interrupt, but at most for the given number of clocks."""
         return self._execute("c", clocks, 0, clocks)
 
     def read(self, address: int, count: int) -> SimulatorAnswer:
-        """Read consecutive words, at most MOST_WORDS. The read stops at the first word that the hardware refuses."""
+        """Read up to MOST_WORDS words. The read stops at the first refused word."""
         answer = self._execute("r", address, count, ACCESS_CLOCKS * count)
         if len(answer.words) != 4 * count and not (answer.response and len(answer.words) < 4 * count):
             self._fail("answered a read with another number of words")

@@ -1,4 +1,4 @@
-"""The state that the dashboard's page shows: the last frames, the times of their stages, rate and losses.
+"""The state that the dashboard shows: the last frames, the times of their stages, rate and losses.
 
     frame outcomes ──▶ Feed ──▶ frames (the last 1000), stage times (means per second), rate, losses by reason
 
@@ -27,7 +27,7 @@ KEPT_BYTES: Final = 128 << 20
 STAGE_SECONDS: Final = 300
 RATE_SECONDS: Final = 5
 STAGES: Final = tuple(each.name for each in fields(StageTimes) if each.name != "boards_compute")
-"""The consecutive stages of a frame. `boards_compute` is left out because it is a part of `compute`."""
+"""The consecutive stages of a frame. `boards_compute` is omitted: it is a part of `compute`."""
 OTHER: Final = "other reasons"
 _MAX_REASONS: Final = 20
 
@@ -54,7 +54,7 @@ class KeptFrame:
 
     @property
     def form(self) -> object:
-        """The labels and shape that posteriors of the same variables share, or False if there is no posterior."""
+        """The labels and shape of the posterior, or False without a posterior."""
         return self.values is not None and (self.labels, self.values.shape)
 
     def sampling_error(self, probabilities: "NDArray[np.float64]") -> "NDArray[np.float64] | None":
@@ -168,7 +168,7 @@ class Feed:
             watcher()
 
     def rate(self, now_s: float) -> float:
-        """Return the mean number of frames per second in the last `RATE_SECONDS` whole seconds."""
+        """Return the mean frames per second in the last `RATE_SECONDS` whole seconds."""
         last = int(now_s)
         recent = [each for each in self._seconds if last - RATE_SECONDS <= each.start < last]
         # from the first frame on, as in the other processes' rates

@@ -32,7 +32,7 @@ from toolchain.deployment import Deployment, load_deployment
 from toolchain.errors import ToolchainError
 
 GREETING_TIME = 5.0
-"""If a client sends no hello for this many seconds, the service disconnects it, so that another client can connect."""
+"""If a client sends no hello for this many seconds, the service disconnects the client."""
 MAX_UNSAID = 4
 """Maximum number of notices that are stored for the next master. Further notices replace the oldest."""
 _REPORT_ATTEMPTS = 100
@@ -300,7 +300,7 @@ def endpoint_from(text: str, flag: str) -> Endpoint:
 
 
 def deployment_for(settings: Settings, *, images: bool = False) -> Deployment:
-    """Load the deployment that the settings name. With `images`, also read and check its images.
+    """Load the deployment that the settings name. With `images`, check its images.
 
     Raises:
         SettingsError: The settings do not name a deployment.

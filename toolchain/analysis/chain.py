@@ -178,9 +178,9 @@ class ExactChain:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChainError:
-    """The expected error of a frame, averaged over readings, and computed without running the machine.
+    """The expected error of a frame, averaged over readings, and computed without a run.
 
-    Distances are total variation distances between posteriors of the searched variables.
+    Distances are total variations between posteriors of the searched variables.
     """
 
     share: float
@@ -202,7 +202,7 @@ class ChainError:
 
 
 def distance(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> float:
-    """Return the total variation distance between two distributions, from 0 to 1."""
+    """Return the total variation distance of two distributions, 0 to 1."""
     return float(np.abs(ours - theirs).sum() / 2)
 
 

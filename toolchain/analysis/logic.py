@@ -89,7 +89,7 @@ class Of(StrEnum):
     STATE_BIT = "state bit"
     """A bit of an LFSR's state, in bm1_lfsr. Its logic loads the seed, or the state after the steps of a cycle."""
     STEP = "step"
-    """One of the steps of an LFSR in a cycle, in bm1_lfsr. Its logic computes the parity of the taps."""
+    """A step of an LFSR in a cycle, in bm1_lfsr. Its logic computes the parity of the taps."""
     PLACE_BIT = "place bit"
     """A bit of the index in a table of random numbers, in bm1_table_player. Its logic computes the next index."""
     WORD = "word"
@@ -101,7 +101,7 @@ class Of(StrEnum):
 
 
 WORST_ERROR: Final = 0.06
-"""Maximum relative error that `scripts/verify resources` accepts in the estimates of ALUTs and ALMs."""
+"""Maximum relative error of estimated ALUTs and ALMs that `scripts/verify resources` accepts."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -254,7 +254,7 @@ BLOCK_SHAPES: Final = ((512, 40), (1024, 20), (2048, 10), (4096, 5), (8192, 2), 
 
 
 def blocks_of(words: int, width: int) -> int:
-    """Return the minimum number of M20Ks for a table with these numbers of words and of bits per word."""
+    """Return the minimum number of M20Ks for a table of the given size."""
     return min(math.ceil(words / deep) * math.ceil(width / wide) for deep, wide in BLOCK_SHAPES)
 
 

@@ -128,7 +128,7 @@ class PartFile:
     records: NDArray[np.void]
     """All records, memory-mapped from the file. Records that `add` writes later appear in this array too."""
     there: bytearray
-    """One byte per row: 1 if the record of the row is in the file, else 0."""
+    """For each row, 1 if the row's record is in the file, else 0."""
     written: int = 0
     """Number of rows that `ready` has yielded."""
 
@@ -178,7 +178,7 @@ class PartFile:
         return None if math.isnan(posterior[0]) else posterior, int(self.records[row]["cycles"])
 
     def ready(self) -> Iterator[NDArray[np.void]]:
-        """Yield batches of records that it has not yielded, in the order of the rows, up to the first absent record."""
+        """Yield batches of new records in the order of the rows, up to the first absent record."""
         rows = len(self.records)
         gap = self.there.find(0, self.written) % (rows + 1)  # -1, for none, becomes the number of rows
         while self.written + _TOGETHER <= gap or self.written < gap == rows:

@@ -29,10 +29,7 @@ _MOST_CODES: Final = 1 << 30
 MACHINE_KEYS: Final = tuple(
     key for key in BM1Section.model_fields if key in BM1Parameters.__dataclass_fields__ and key != "lines"
 )
-"""Keys of `[machine]` that are also fields of BM1Parameters, except `lines`.
-
-In `[machine]`, the key `lines` counts the lines of all boards.
-"""
+"""Keys of `[machine]` that are fields of BM1Parameters. `lines` is missing: `[machine]` counts all boards' lines."""
 
 
 def machine_options(source: BuildOptions | MachineSection, keys: Iterable[str]) -> dict[str, Any]:
@@ -52,18 +49,18 @@ def option(key: str, options: BuildOptions, section: type[BM1Section | BM2Sectio
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MachinePlan:
-    """The parameters and options of the BM1 for a model, decided before any table is computed."""
+    """The parameters of the BM1 for a model, before any table is computed."""
 
     kind: ClassVar = "BM1"
     why: ClassVar = "the known variables are independent given the searched ones"
-    """The reason why the build chooses a BM1, as a clause of a sentence."""
+    """The reason why the build chooses a BM1, as a clause."""
     model: Model
     options: BuildOptions
     """The options of the build. Later, `fit_to_device` may change the numbers of boards and replicas."""
     parameters: BM1Parameters
     """The parameters of the whole machine, with the lines of all boards."""
     target_count: int
-    """The machine stops when the count of a line reaches this number."""
+    """Count of a line at which the machine stops."""
     max_cycles: int
     """The maximum number of cycles of a frame."""
 
@@ -155,7 +152,7 @@ def _filter_options(options: BuildOptions) -> BuildOptions:
 
 
 def whole_machine(plan: MachinePlan, quantised: Quantised) -> BM1Machine:
-    """Return the undivided machine, which has all lines of the model, or raise a BuildError."""
+    """Return the undivided machine with all lines, or raise a BuildError."""
     parameters, table = plan.parameters, plan.options.rng_table
     if table is None and parameters.rng is RngKind.TABLE:
         table = random_table(parameters.prob_bits)
@@ -167,7 +164,7 @@ def whole_machine(plan: MachinePlan, quantised: Quantised) -> BM1Machine:
 
 @dataclass(frozen=True, slots=True)
 class LineBlock:
-    """The lines of one board: the first line has the index `offset`, and the board has `lines` lines."""
+    """The consecutive lines of one board. The first line has the index `offset`."""
 
     offset: int
     lines: int
@@ -217,9 +214,9 @@ class BoardLayout:
     blocks: tuple[LineBlock, ...]
     """The block of lines of each board. No block is larger than the first."""
     interface: tuple[int, int]
-    """Number of input words and number of result words in a board's registers."""
+    """Numbers of input words and of result words in a board's registers."""
     reason: str
-    """The reason for the size of the interface, as a clause that follows the size."""
+    """The reason for the size of the interface, as a clause."""
 
 
 def board_layout(
@@ -253,8 +250,8 @@ def fitted_layout(
 ) -> BoardLayout:
     """Return the layout of boards, or raise a BuildError if the boards, interface and register map do not fit.
 
-    `asked` is the size that the user wants. If `asked` is None, the interface gets the size that `used` needs. In
-    errors, `what` describes a board. If a board does not fit the register map, the error ends with `advice`.
+    `asked` is the wanted size; None stands for the size that `used` needs. In errors, `what` describes a board. If a
+    board does not fit the register map, the error ends with `advice`.
     """
     needed, room = (used.input_words, used.result_words), interface_room(used)
     sentence = f"a board needs {counted(needed[0], 'input')} and {counted(needed[1], 'result')} ({what})"
@@ -276,7 +273,7 @@ def fitted_layout(
 
 
 def size_text(size: tuple[int, int]) -> str:
-    """Return the size of an interface as the text in `deployment.toml`, for example `20x1200`."""
+    """Return the size of an interface as text, for example `20x1200`."""
     return f"{size[0]}x{size[1]}"
 
 

@@ -32,7 +32,7 @@ ModelPath: TypeAlias = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class ModelFlags:
-    """Flags that describe a model: the parameters of a `model.py`, or the variables of a network file."""
+    """Flags that describe a model: parameters of a `model.py`, or variables of a network file."""
 
     settings: Settings = None
     searched: Annotated[str, typer.Option(help="Searched variables.", metavar="A,B")] = ""
@@ -131,7 +131,7 @@ def read_source(path: Path, flags: ModelFlags) -> "Model | Question":
 
 
 def read_model(path: Path, flags: ModelFlags, bits: Iterable[str] | None = None) -> "Model":
-    """Return the model for a BM1. Each of `bits` is `NAME=BITS`, and sets the address bits of a column."""
+    """Return the model for a BM1. Each of `bits` is `NAME=BITS`, the address bits of a column."""
     from toolchain.building.machine import with_bits
     from toolchain.models.joint import Question
 

@@ -133,7 +133,7 @@ class DeploymentFile(Section):
 
 
 class Deployment(DeploymentFile):
-    """The content of `deployment.toml` together with its folder, as the services use them."""
+    """The content of `deployment.toml` and its folder, for the services."""
 
     directory: Path = Field(default=Path(), exclude=True)
 
@@ -233,7 +233,7 @@ def deployment_hash(deployment: DeploymentFile) -> str:
 
 
 def with_hash(deployment: Deployment) -> Deployment:
-    """Return a copy of a deployment, in which `hash` is the hash of the content."""
+    """Return a copy of a deployment with the hash of its content."""
     return deployment.replace(hash=deployment_hash(deployment))
 
 

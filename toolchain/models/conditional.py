@@ -1,8 +1,8 @@
-"""Conditional distributions P(K | S) of a reading K, given the searched variables S: normals, or wrapped normals.
+"""Conditional distributions P(K | S) of a reading K: normals or, for bearings, wrapped normals.
 
-Wrapped normals are for bearings. The address of a reading is the index of its bin. A bin extends half a step to each
-side of its centre. A bin's probability is the integral of the normal over the bin, not the density at the centre. So
-coarse bins are exact too. The lines of a table are the values of S.
+The address of a reading is the index of its bin. A bin extends half a step to each side of its centre. A bin's
+probability is the integral of the normal over the bin, not the density at the centre. So coarse bins are exact too.
+The lines of a table are the values of the searched variables S.
 """
 
 import math
