@@ -1,6 +1,5 @@
-"""The rosbridge protocol without ROS: an asyncio client, an embedded server, and access to fields of messages.
+"""The rosbridge protocol without ROS: asyncio client, embedded server, and field lookup in messages.
 
-`connect` in `bridge.client` connects to a server, for topics, services and actions. `serve_hub` in
-`bridge.hub.server` runs a server for programs and tests. `bridge.errors` contains the errors of connections and
-messages.
+Clients start at `connect` in `bridge.client`, for topics, services and actions. `serve_hub` in `bridge.hub.server` runs
+a server for programs and tests. `bridge.errors` contains the errors of connections and messages.
 """

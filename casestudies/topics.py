@@ -48,7 +48,7 @@ class Readiness:
         self._done = 0
 
     def record(self) -> None:
-        """Record that the process has just done a step of its work."""
+        """Record that the process has just done its work."""
         self._last = time.monotonic()
         self._done += 1
 
@@ -62,10 +62,7 @@ class Readiness:
 
 @contextlib.asynccontextmanager
 async def connected(name: str, work: str, uri: str) -> AsyncIterator[tuple[Ros, Readiness]]:
-    """Connect to a server within the context, and report the readiness of the process `name` in the run directory.
-
-    `work` describes a step of the work, as in `Readiness`.
-    """
+    """Within the context, connect to a server, and report in the run directory how recently `work` was done."""
     started, readiness = time.monotonic(), Readiness(work)
 
     def answer() -> bytes:
@@ -85,10 +82,7 @@ async def connected(name: str, work: str, uri: str) -> AsyncIterator[tuple[Ros, 
 
 
 def run_viewer(watching: Coroutine[Any, Any, None], finish: Callable[[], None]) -> None:
-    """Run a viewer, and call `finish` when the viewer ends.
-
-    If Ctrl-C or a lack of results ends the viewer, `finish` is called, too. After another error it is not called.
-    """
+    """Run a viewer. Call `finish` at its end, also after Ctrl-C or a lack of results, but not after other errors."""
     try:
         run_async(watching)
     except (NoResultError, StoppedError) as ended:
@@ -124,8 +118,8 @@ async def report_refused(
 class LossyPublication:
     """A publication that drops messages while the server is disconnected or slow.
 
-    A message that is too large for the server is dropped, too. The user gets one warning if the server is slow, and one
-    if a message is too large. After a successful publication, both warnings can appear again.
+    A message that is too large for the server is dropped, too. The user gets one warning of a slow server and one of a
+    large message until messages are published again.
     """
 
     def __init__(self, publication: Publication) -> None:
@@ -182,7 +176,7 @@ class Instance:
 
     @property
     def posterior(self) -> Posterior | None:
-        """The posterior of the frame, or None if the frame has no posterior."""
+        """The posterior, or None if the frame has none."""
         return self.heard if isinstance(self.heard, Posterior) else None
 
     @property
@@ -313,10 +307,9 @@ class Listener:
 async def listen(
     ros: Ros, *, truth_topic: str | None = None, truth_tolerance_s: float = 0.0
 ) -> AsyncIterator[Listener]:
-    """Listen to the frames on `/bm/frame` and `/BMresults`, and to true poses on `truth_topic` if it is given.
+    """Listen to `/bm/frame` and `/BMresults`. If `truth_topic` is given, also listen to its geometry_msgs/PoseStamped.
 
-    True poses are geometry_msgs/PoseStamped. A true pose belongs to a frame if the stamps are equal, or if the pose is
-    older by at most `truth_tolerance_s` seconds.
+    A true pose belongs to a frame if the stamps are equal, or if the pose is older by at most `truth_tolerance_s`.
     """
     async with contextlib.AsyncExitStack() as stack:
         heard = await stack.enter_async_context(posteriors(ros, queue_size=_QUEUE_SIZE))

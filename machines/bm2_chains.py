@@ -69,10 +69,10 @@ _Ran = tuple[Integers, list[int], npt.NDArray[Any]]
 
 
 class Chains:
-    """The chains of one model, each with a machine. The machines differ only in `chain` and `chains`.
+    """The chains of one model. Their machines differ only in `chain` and `chains`.
 
     Raises:
-        ParameterError: The machines differ in other parameters, or in their tables.
+        ParameterError: The machines differ in something else.
     """
 
     def __init__(self, machines: Sequence[BM2Machine]) -> None:

@@ -61,7 +61,7 @@ def searched_counts(parameters: BM2Parameters, results: npt.NDArray[np.integer])
     """Return the counts of the searched variables' joint values: integers[..., product of cardinalities], row-major.
 
     `results` is integers[..., result_words]. If a machine has no joint histogram, only one variable may be searched.
-    The counts are then from the histogram of this variable.
+    The histogram of this variable then has the counts.
     """
     first = parameters.histogram_words
     if not parameters.joint_words:
@@ -75,9 +75,9 @@ def searched_counts(parameters: BM2Parameters, results: npt.NDArray[np.integer])
 
 
 def searched_values(parameters: BM2Parameters, stream: npt.NDArray[np.uint32]) -> npt.NDArray[np.int64]:
-    """Return for each state the index of the searched variables' joint value, or -1 if a variable has an unused code.
+    """Return for each state the index of the searched joint value, or -1 if the state has an unused code.
 
-    `stream` contains the states, uint32[samples, state_words].
+    The states are uint32[samples, state_words].
     """
     codes = unpack_all(parameters.cardinalities, stream)
     values = np.zeros(len(stream), dtype=np.int64)
@@ -130,9 +130,8 @@ def standard_error(probabilities: Floats, effective: Floats | float) -> Floats:
 def effective_samples(values: npt.NDArray[np.integer], size: int) -> Floats:
     """Return for each value the number of effective samples of the value's indicator: float64[size].
 
-    The method is Geyer's initial positive sequence (1992). `values` is integers[samples] from 0 to `size` - 1. The
-    number of effective samples is at most the number of samples. If all samples or no samples have a value, both
-    numbers are equal.
+    The method is Geyer's initial positive sequence (1992). `values` is integers[samples] below `size`. The result is at
+    most the number of samples, and equal to it for a value that all samples or no samples have.
     """
     samples = len(values)
     padded = 1 << (2 * samples - 1).bit_length()  # so that the correlations do not wrap around
@@ -152,9 +151,8 @@ def effective_samples(values: npt.NDArray[np.integer], size: int) -> Floats:
 def batch_effective_samples(counts: npt.NDArray[np.integer]) -> Floats:
     """Return for each value the number of effective samples, from the means of a chain's batches: float64[values].
 
-    `counts` is integers[batches, values], and cumulative over the batches. The number of effective samples is at most
-    the number of samples. If a value is equally frequent in all batches, both numbers are equal. If fewer than
-    `BATCHES_MIN` batches have samples, the result is NaN.
+    `counts` is integers[batches, values], cumulative. The result is at most the number of samples, and equal to it if
+    all batches have the value equally often. It is NaN if fewer than `BATCHES_MIN` batches have samples.
     """
     of_batch = np.diff(counts.astype(np.float64), axis=0, prepend=0)
     of_batch = of_batch[of_batch.any(axis=1)]
@@ -173,8 +171,8 @@ def batch_effective_samples(counts: npt.NDArray[np.integer]) -> Floats:
 def split_r_hat(counts: npt.NDArray[np.integer]) -> Floats:
     """Return for each value the split R-hat of the value's indicator (Gelman et al. 2013): float64[values].
 
-    `counts` has the counts of each half of a chain, integers[halves, values]. Each half needs at least 2 samples. If an
-    indicator is constant within every half, R-hat is 1 if all halves agree, and otherwise infinite.
+    `counts` is integers[halves of chains, values], with 2 or more samples in each half. If an indicator is constant
+    within every half, R-hat is 1 if all halves agree, otherwise infinite.
     """
     n = counts.sum(axis=1, keepdims=True).astype(np.float64)
     means = counts / n

@@ -1,11 +1,11 @@
 """Programming files, which the toolchain builds from a model and the loader sends to a board (thesis 3.4).
 
-A file consists of a fixed header, a manifest, and a section for each table of the machine. The manifest is readable
-JSON (`head -c 4000 board0.bm`). The header contains the SHA-256 of the manifest, and the manifest contains the SHA-256
-of every section. An error can therefore name the damaged part. Equal images have equal bytes.
+A file has a fixed header, a manifest, and a section for each table of the machine. The manifest is readable JSON
+(`head -c 4000 board0.bm`). The header contains the SHA-256 of the manifest, and the manifest the SHA-256 of every
+section. An error therefore names the damaged part. Equal images have equal bytes.
 
-`image_hash` identifies the computation. It covers the parameters, the tables, the partition, the interface, the model
-and the register map. It does not cover the build date and the version of the tools.
+`image_hash` identifies the computation: parameters, tables, partition, interface, model and register map. It does not
+cover the build date and the version of the tools.
 """
 
 import hashlib
@@ -208,7 +208,7 @@ def image_bytes(image: Image) -> bytes:
 
 
 def read_image(path: Path) -> Image:
-    """Check all hashes of a programming file, and return the image that it contains.
+    """Return the image in a programming file, and check all hashes.
 
     Raises:
         ImageError: The file cannot be read.

@@ -20,12 +20,12 @@ class Axis:
 
     @property
     def unit(self) -> str:
-        """The unit of the axis's values, or an empty string if the values have no unit."""
+        """The unit of the axis's values, or an empty string."""
         return "" if self.dimension is None else self.dimension.unit
 
     @property
     def has_states(self) -> bool:
-        """True if the values of the cells are names of states instead of numbers."""
+        """True if the values are names of states instead of numbers."""
         return self.dimension is not None and bool(self.dimension.states)
 
     def value(self, index: float) -> float | str:
@@ -58,19 +58,16 @@ def reading_order(labels: Sequence[str]) -> list[int]:
 
 
 def in_words(axes: Sequence[Axis], indices: Mapping[str, float]) -> str:
-    """Return a cell or a mean as text: `x -0.5 m, y 2.5 m` or `room hall`.
-
-    Without a deployment, the text shows the indices: `cell x 2, y 1`.
-    """
+    """Return a cell or a mean as text: `x -0.5 m, y 2.5 m`. Without a deployment, show indices: `cell x 2, y 1`."""
     ordered = [axes[at] for at in reading_order([axis.label for axis in axes])]
     words = ", ".join(f"{printable(axis.label)} {axis.shown(indices[axis.label])}" for axis in ordered)
     return words if any(axis.dimension for axis in axes) else f"cell {words}"
 
 
 def state_in_words(dimensions: "Sequence[Dimension]", codes: Sequence[int]) -> str:
-    """Return a sampled state as text, such as `rain=yes  grass=wet`. `codes` has a code for each dimension.
+    """Return a sampled state as text: `rain=yes  grass=wet`.
 
-    Without dimensions, `codes` are the 32-bit words of the state, and the text shows the words in hexadecimal.
+    Without dimensions, `codes` are the 32-bit words of the state, and the text is hexadecimal.
     """
     if not dimensions:
         return " ".join(f"{word:08x}" for word in reversed(codes))
@@ -81,7 +78,7 @@ def state_in_words(dimensions: "Sequence[Dimension]", codes: Sequence[int]) -> s
 
 
 def printable(text: str) -> str:
-    """Return a received text for display. The result is short, and has no control characters."""
+    """Return received text shortened and without control characters."""
     # labels come over the wire: they must not fill the screen, nor control it
     text = text if len(text) <= _LABEL else text[: _LABEL - 3] + "..."
     return text if text.isprintable() else repr(text)

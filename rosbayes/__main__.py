@@ -1,7 +1,4 @@
-"""The command `rosbayes`. Its subcommands are the project's commands: `rosbayes hub` runs `hub`.
-
-If the command line names a subcommand, only the module of this subcommand is imported.
-"""
+"""The command `rosbayes`, which runs the other commands. It imports only the module of the given subcommand."""
 
 from importlib.metadata import version
 from typing import Annotated
@@ -31,7 +28,7 @@ def rosbayes(
 ) -> None:
     """Bayesian machines for any ROS robot.
 
-    Start with `rosbayes demo`. Each other subcommand also exists as a separate command: `rosbayes hub` is `hub`, and
+    Start with `rosbayes demo`. Each other subcommand is also a separate command: `rosbayes hub` is `hub`, and
     `rosbayes build` is `toolchain build`.
     """
 

@@ -19,7 +19,7 @@ class InputLineError(StackError):
 
 
 class LocalSocketError(StackError):
-    """A local socket cannot be created, or bytes that arrived on a local socket are not a record."""
+    """A local socket cannot be created, or received bytes are not a record."""
 
     exit_code = ExitCode.CHILD
 
@@ -35,7 +35,7 @@ class NoDataError(StackError):
 
 
 class RosbridgeLostError(StackError):
-    """The connection to the rosbridge server was lost in a run with `--once`."""
+    """The rosbridge server was lost in a run with `--once`."""
 
     exit_code = ExitCode.ROSBRIDGE
 

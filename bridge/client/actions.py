@@ -26,7 +26,7 @@ from bridge.names import absolute
 _log = logging.getLogger("bridge")
 
 FEEDBACK_QUEUE_SIZE: Final = 64
-"""Maximum number of queued feedback messages of one goal. A further message replaces the oldest queued message."""
+"""Maximum number of feedback messages queued for one goal. A further message replaces the oldest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,7 +34,7 @@ class GoalResult:
     """Result of a goal.
 
     Attributes:
-        status: Whether the goal succeeded, was canceled or was aborted.
+        status: Succeeded, canceled or aborted.
         values: Fields of the result.
     """
 
@@ -46,8 +46,8 @@ class Goal:
     """A goal that this client has sent. Use `async for feedback in goal`, then `await goal.result(timeout)`.
 
     The iteration ends when the goal ends. If the connection is lost, the iteration and `result` fail, because the
-    server never reports the end of the goal. If the program leaves `async with` before the goal ends, the goal is
-    cancelled. The iteration and `result` then fail, too.
+    server never reports the end. If the program leaves `async with` early, the goal is cancelled. The iteration and
+    `result` then fail, too.
 
     Attributes:
         action: Name of the action.
@@ -86,7 +86,7 @@ class Goal:
         self._wake()
 
     def fail(self, reason: str) -> None:
-        """End the goal without a result after a loss of the connection. The error's text begins with `reason`."""
+        """End the goal without a result, because the connection was lost for `reason`."""
         self._fail(DisconnectedError(f"{reason} during a goal of {self.action}"))
 
     def _fail(self, error: BridgeError) -> None:
@@ -196,15 +196,15 @@ class GoalRequest:
 
     @property
     def canceling(self) -> bool:
-        """True if the sender of the goal has asked for its cancellation."""
+        """True if the sender has asked to cancel the goal."""
         return self._canceling.is_set()
 
     async def wait_canceling(self) -> None:
-        """Wait until the sender of the goal asks for its cancellation."""
+        """Wait until the sender asks to cancel the goal."""
         await self._canceling.wait()
 
     def ask_to_cancel(self) -> None:
-        """Tell the handler that the sender of the goal asks for its cancellation."""
+        """Tell the handler that the sender asks to cancel the goal."""
         self._canceling.set()
 
     def feed_back(self, values: Mapping[str, Any]) -> None:
@@ -221,7 +221,7 @@ class GoalRequest:
         self._finish(GoalStatus.ABORTED, values or {})
 
     def cancel(self, values: Mapping[str, Any] | None = None) -> None:
-        """End the goal as cancelled. `values` is the result that the handler has reached so far."""
+        """End the goal as cancelled. `values` is the result so far."""
         self._finish(GoalStatus.CANCELED, values or {})
 
     def _finish(self, status: GoalStatus, values: Mapping[str, Any] | str) -> None:
@@ -276,7 +276,7 @@ class ActionServer(Handle):
         self._register()
 
     def receive(self, event: GoalRequested | CancelRequested) -> None:
-        """Start the handler of a requested goal, or tell a running handler about the request to cancel."""
+        """Start a requested goal, or tell the handler of a goal to cancel the goal."""
         if isinstance(event, CancelRequested):
             if event.goal in self._goals:
                 self._goals[event.goal][0].ask_to_cancel()

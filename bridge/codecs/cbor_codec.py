@@ -158,7 +158,7 @@ def _check(message: dict[str, Any], arrays: Arrays, data: bytes) -> None:
 
 
 def encode_json(message: dict[str, Any]) -> bytes:
-    """Return the CBOR encoding of a message that was read from JSON, if the message's ROS type is unknown.
+    """Encode a decoded JSON message of unknown ROS type as CBOR.
 
     A list of numbers with at least one float becomes a typed array of float64, and None becomes NaN. A list of
     integers remains a list, because the width of the integers is unknown.

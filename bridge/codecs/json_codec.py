@@ -70,7 +70,7 @@ def excerpt(data: bytes | str) -> str:
 
 
 def text_of(value: Any) -> str:
-    """Return a server's explanation as text. If the server sent an object instead of a string, the text is JSON."""
+    """Return a server's explanation as text. Some servers send an object, which becomes JSON."""
     if isinstance(value, str):
         return value
     return "" if value is None else orjson.dumps(value).decode()
@@ -241,7 +241,7 @@ def _in_native_byte_order(value: Any) -> Any:
 
 
 def find_nonfinite(message: Any) -> str | None:
-    """Return the path of the first NaN or infinity in a message, such as `scan.ranges[3]`, or None if it has none."""
+    """Return the path of the first NaN or infinity in a message, such as `scan.ranges[3]`, or None."""
     inner: list[tuple[str, Any]] = [("", message)]
     while inner:
         place, value = inner.pop()
@@ -286,11 +286,10 @@ def envelope_of(data: bytes) -> bytes:
 
 
 def topic_of(envelope: bytes) -> str | None:
-    """Return the topic of an envelope, or None if `envelope` is not an envelope.
+    """Return the topic of an envelope, or None if the bytes are not an envelope.
 
-    An envelope is the text before the message in a publish operation. The operation must have only the keys `op`,
-    `topic` and `msg`, and `msg` must be the last. For the check, an empty message and a brace are appended to the text,
-    and the result is parsed.
+    An envelope is the text before the message in a publish operation. The operation has only the keys `op`, `topic` and
+    `msg`, and `msg` is the last key.
     """
     try:
         operation: Any = orjson.loads(envelope + b"{}}")

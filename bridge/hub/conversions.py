@@ -62,7 +62,7 @@ DUMMY: Final = "structure_needs_at_least_one_member"
 
 
 class Builder:
-    """Builder of rosbags' message objects from JSON. An absent field gets the default of its type."""
+    """Builder of rosbags' message objects from JSON. An absent field gets its default."""
 
     def __init__(self, store: "Typestore", max_values: int) -> None:
         self._store = store
@@ -174,10 +174,9 @@ def _numbers(values: Any, element: str, length: int, place: str) -> list[Any] | 
 def cbor_encoder(
     store: "Typestore", name: str, defaults: Callable[[str], dict[str, Any]], known: dict[str, Encode | None]
 ) -> Encode | None:
-    """Return a function that encodes messages of the type `name` as CBOR with typed arrays.
+    """Return a function that encodes a message with typed arrays, or None if no field has an array of numbers.
 
-    Return None if messages of this type contain no array of numbers. `defaults` returns the default values of a type's
-    fields. `known` stores the functions for nested message types.
+    `defaults` returns the default values of a type's fields. `known` stores the functions of nested message types.
     """
     encoders: dict[str, Encode] = {}
 

@@ -1,12 +1,11 @@
 """The services of ROS's `rosapi` node, which the hub answers from its own state.
 
-Clients call the services for diagnosis, for parameters and for the fields of messages. Diagnosis includes topics with
-their types and publishers. Names, fields and types are those of the ROS version that the hub emulates
-(http://wiki.ros.org/rosapi, rosapi_msgs). A service that exists in only one version is answered in both versions. A
-time has the fields of both versions: `secs` and `nsecs`, `sec` and `nanosec`.
+Clients call the services for diagnosis, parameters and the fields of messages. Names, fields and types are those of the
+emulated ROS version (http://wiki.ros.org/rosapi, rosapi_msgs). A service that exists in only one version is answered in
+both. A time has the fields of both versions: `secs` and `nsecs`, `sec` and `nanosec`.
 
-The hub stores parameters in a flat dictionary from names to JSON. If an access to a parameter fails, a hub of ROS 2
-answers with `successful` and `reason`. In a hub of ROS 1, the call fails.
+Parameters are a flat dictionary from names to JSON. If an access to a parameter fails, a hub of ROS 2 answers with
+`successful` and `reason`. In ROS 1, the call fails.
 """
 
 from collections.abc import Callable, Iterable
@@ -24,11 +23,11 @@ from bridge.hub.limits import HubLimits, RefusedOperationError
 from bridge.names import MAX_NAME, absolute, ros1_type, ros2_type
 
 NODE: Final = "/rosapi"
-"""Name of the node that offers the services of rosapi."""
+"""Name of the node that offers rosapi's services."""
 PREFIX: Final = NODE + "/"
 """Prefix of the names of rosapi's services. Clients cannot offer services with this prefix."""
 ROSOUT: Final = "/rosout"
-"""The topic of ROS's log, on which the hub also reports the operations that it refuses."""
+"""The topic of ROS's log, on which the hub reports refused operations."""
 # Topics that a server of ROS 1's actionlib publishes or subscribes to under its name.
 _ACTIONLIB: Final = ("goal", "cancel", "status", "feedback", "result")
 
@@ -119,7 +118,7 @@ class Rosapi:
         return answer(*given)
 
     def service_type_name(self, type_name: str) -> str:
-        """Return the name of a service type in the form that the emulated ROS version uses."""
+        """Return the name of a service type in the form of the emulated ROS version."""
         return ros2_type(type_name, "srv") if self.ros_version == 2 else ros1_type(type_name)
 
     # --- topics

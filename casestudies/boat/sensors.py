@@ -33,7 +33,7 @@ BEARING_SIGMA: Final = 10.0
 
 
 def map_grid(width: int = 32, height: int = 32) -> Grid:
-    """Return the map as a grid of cells. The thesis ran a grid of 32 x 32 cells on four boards (section 4.2)."""
+    """Return the map as a grid of cells. The thesis ran 32 x 32 cells on four boards (4.2)."""
     return Grid(x_low=MAP_LOW, x_high=MAP_HIGH, y_low=MAP_LOW, y_high=MAP_HIGH, width=width, height=height)
 
 
@@ -61,9 +61,9 @@ ARRAY_TYPE: Final = "std_msgs/Float64MultiArray"
 TRUE_POSE_TOPIC: Final = "/boat/true_pose"
 TRUE_POSE_TYPE: Final = "geometry_msgs/PoseStamped"
 SET_POSE_TOPIC: Final = "/boat/set_pose"
-"""Topic of poses, of the type `TRUE_POSE_TYPE`. Any client may publish a pose to move the boat there."""
+"""Topic on which any client may publish a pose (`TRUE_POSE_TYPE`) to move the boat there."""
 DRIVE_TOPIC: Final = "/cmd_vel"
-"""Topic of velocities, of the type `DRIVE_TYPE`. Any client may publish a velocity to drive the boat."""
+"""Topic on which any client may publish a velocity to drive the boat."""
 DRIVE_TYPE: Final = "geometry_msgs/Twist"
 COMPASS_TOPIC: Final = "/boat/imu"
 COMPASS_TYPE: Final = "sensor_msgs/Imu"
@@ -103,7 +103,7 @@ class BadNumberError(Exception):
 
 
 def read_set_pose(message: dict[str, Any]) -> tuple[float, float]:
-    """Return x and y of a geometry_msgs/PoseStamped, or raise a BadNumberError if one is not a finite number."""
+    """Return x and y of a geometry_msgs/PoseStamped, or raise a BadNumberError."""
     return _number(message, "pose.position.x"), _number(message, "pose.position.y")
 
 
@@ -143,7 +143,7 @@ def beacon_markers(head: dict[str, Any]) -> dict[str, Any]:
 
 
 def true_pose(x: float, y: float, head: dict[str, Any], heading: float = 0.0) -> dict[str, Any]:
-    """Return a geometry_msgs/PoseStamped with the header `head`, at (x, y), with a heading in radians."""
+    """Return a geometry_msgs/PoseStamped at (x, y), with a heading in radians."""
     return {
         "header": head,
         "pose": {"position": {"x": x, "y": y, "z": 0.0}, "orientation": _rotation(heading)},
@@ -172,10 +172,10 @@ def _rotation(heading: float) -> dict[str, float]:
 def readings_message(
     values: Sequence[float | None], head: Mapping[str, Any] | None, *, array: bool
 ) -> dict[str, Any]:
-    """Return a message with six readings, in the order of `SENSOR_NAMES`, and with the header `head` if it is given.
+    """Return a message with six readings, in the order of `SENSOR_NAMES`, and with the header `head`, if any.
 
-    With `array`, the message is a std_msgs/Float64MultiArray, which has no header. A missing reading (None) becomes
-    null in an array, because rosbridge writes NaN as null. In a message with named fields, its field is absent.
+    With `array`, the message is a std_msgs/Float64MultiArray without a header. A missing reading (None) is null in an
+    array, as rosbridge writes NaN. Without `array`, the field of a missing reading is absent.
     """
     if array:
         return {
@@ -195,7 +195,7 @@ def read_raw(
 ) -> tuple[tuple[float | None, ...], Mapping[str, Any] | None]:
     """Return the six raw readings and the header of a message, or raise a BadNumberError.
 
-    A reading that is absent, null or NaN becomes None. The header is None if the message has none.
+    A reading that is absent, null or NaN becomes None. The header may be None.
     """
     if array:
         data = message.get("data")

@@ -1,6 +1,6 @@
-"""The model of a pixel's disparity, and the topics of the disparity case study (thesis 4.4).
+"""The topics of the disparity case study, and its model of a pixel (thesis 4.4).
 
-The model is P(d) P(k1 | d) P(k2 | d) P(k3 | d). d is the disparity, and k1 to k3 are three filters' matching costs.
+The model is P(d) P(k1 | d) P(k2 | d) P(k3 | d), with the disparity d and the matching costs k1 to k3.
 """
 
 from typing import Final
@@ -11,7 +11,7 @@ from casestudies.disparity.matching import FILTERS, OUTLIER, SCALES
 from toolchain.models import IntegerType, JointDistribution, Question, Symbol, table, uniform
 
 DISPARITIES: Final = 16
-"""Number of disparities, from 0 to 15 pixels. A machine has a line for each disparity."""
+"""Number of disparities, 0 to 15 pixels. A machine has a line for each."""
 PIXELS: Final = 160
 """Number of pixels that a board computes at once. The board has a replica of the machine for each pixel."""
 
@@ -22,9 +22,9 @@ TRUTH_TOPIC: Final = "/stereo/true_disparity"
 DISPARITY_TOPIC: Final = "/stereo/disparity"
 TILE_TOPIC: Final = "/disparity/likelihoods"
 TILE_TYPE: Final = "disparity_msgs/Likelihoods"
-"""Type of messages with a header and, for each filter, a `uint8[]` field with the name of the filter.
+"""Type of messages with a header, and a `uint8[]` field named after each filter.
 
-The field of a filter contains a likelihood from 0 to 255 for each pixel and disparity.
+A field has a likelihood from 0 to 255 for each pixel and disparity.
 """
 
 _COSTS: Final = 64

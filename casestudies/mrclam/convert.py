@@ -26,7 +26,7 @@ from toolchain.bounded_files import read_bounded
 from toolchain.errors import ModelError
 
 LARGEST_FILE: Final = 1 << 28
-"""Maximum size of an input file in bytes. The largest file of the data set has about 20 million bytes."""
+"""Maximum size of an input file in bytes. The data set has files of up to 20 million bytes."""
 LEAST_LANDMARKS: Final = 3
 MOST_MOVED_M: Final = 0.12
 WINDOW_S: Final = 1.0
@@ -61,7 +61,7 @@ class Track:
         return x, y, heading
 
     def known(self, begin: float, end: float) -> bool:
-        """Return whether the track covers the time from `begin` to `end`, in seconds, without a gap."""
+        """Return whether the track has no gap between two times (s)."""
         inside = self.time[(self.time > begin) & (self.time < end)]
         around = np.concatenate((self.time[self.time <= begin][-1:], inside, self.time[self.time >= end][:1]))
         ends_known = len(around) > 1 and around[0] <= begin and around[-1] >= end
@@ -87,10 +87,7 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Window:
-    """One second of a track. `time` is the middle of the second. The pose is the reference at this time.
-
-    `seen` has the median range (m) and the median absolute bearing (rad) of each landmark.
-    """
+    """The pose at the middle of a second, and each landmark's median range (m) and absolute bearing (rad)."""
 
     time: float
     x: float
@@ -102,8 +99,8 @@ class Window:
 def read_columns(path: Path, names: Sequence[str]) -> Iterator[tuple[str, tuple[float, ...]]]:
     """Yield the place and the numbers of each line of a file, or raise a ModelError.
 
-    The place is the path and the line number, for error messages. Numbers are separated by spaces, and comments begin
-    with `#`. `names` are the names of the columns.
+    The place is a path and a line number, for error messages. Numbers are separated by spaces, and comments begin with
+    `#`.
     """
     text = read_bounded(path, LARGEST_FILE, ModelError).decode(errors="replace")
     for number, line in enumerate(text.splitlines(), 1):
@@ -162,10 +159,7 @@ def read_track(folder: Path, robot: int) -> Track:
 
 
 def read_measured(folder: Path, robot: int, subjects: dict[int, int]) -> tuple[list[Measured], int]:
-    """Return a robot's sightings of landmarks from `RobotN_Measurement.dat`, and the number of misread sightings.
-
-    A sighting counts as misread if its barcode is unknown or its range is negative.
-    """
+    """Return a robot's sightings of landmarks. Also return how many have an unknown barcode or a negative range."""
     path = folder / f"Robot{robot}_Measurement.dat"
     found, misread = [], 0
     for _, (time, barcode, away, bearing) in read_columns(
@@ -180,10 +174,7 @@ def read_measured(folder: Path, robot: int, subjects: dict[int, int]) -> tuple[l
 
 
 def windows(track: Track, measured: Sequence[Measured]) -> tuple[list[Window], Counter[str]]:
-    """Return the seconds in which the robot hardly moved and saw enough landmarks.
-
-    Also return how many other seconds with sightings are left out, for each reason.
-    """
+    """Return the seconds in which the robot hardly moved and saw enough landmarks. Count omitted seconds by reason."""
     kept: list[Window] = []
     left_out: Counter[str] = Counter()
     if not measured:
@@ -224,7 +215,7 @@ def _wrapped(angle: float) -> float:
 
 
 def write_recording(path: Path, kept: Sequence[Window]) -> None:
-    """Write a CSV file for `casestudies.mrclam.player`, with a row for each second, or raise an OutputError."""
+    """Write a CSV file for `casestudies.mrclam.player`, or raise an OutputError."""
     heading = ["time_s", "ref_x_m", "ref_y_m", "ref_std_m", "heading_rad"]
     heading += [name for number in LANDMARKS for name in (f"range_{number}_m", f"bearing_{number}_rad")]
     rows = []
@@ -252,7 +243,7 @@ def _write(path: Path, heading: Sequence[str], rows: Sequence[Sequence[str]]) ->
 
 
 def robots_in(folder: Path) -> list[int]:
-    """Return the numbers of the robots with measurements in the folder, or raise a ModelError if there are none."""
+    """Return the numbers of the robots with measurements in the folder, or raise a ModelError."""
     found = sorted(
         int(match[1])
         for path in folder.glob("Robot*_Measurement.dat")

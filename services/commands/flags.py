@@ -29,10 +29,7 @@ def with_settings(*names: str) -> Callable[[Callable[..., int]], Callable[..., i
 
 
 def refuse_with_deployment(settings: Settings, flags: Mapping[str, str | None]) -> None:
-    """Raise a SettingsError if there is a deployment, and one of the flags has a value.
-
-    The flags describe a topic, but a deployment has its own topics.
-    """
+    """Raise a SettingsError if flags that describe a topic are given with a deployment, which has its own topics."""
     given = [f"{flag} {value}" for flag, value in flags.items() if value]
     # if it were ignored, the command would use another topic than the user named
     if settings.deployment is not None and given:

@@ -48,13 +48,13 @@ class View:
         return self._feed.newest if self.at is None else self._feed.frame(self.at)
 
     def pause(self, paused: bool) -> None:
-        """If `paused` is true, stay at the frame that is shown. Otherwise return to the newest frame."""
+        """If `paused`, stay at the frame that is shown, otherwise return to the newest."""
         frame = self.frame
         self.at = frame.at if paused and frame is not None else None
         self._feed.changed()
 
     def step(self, frames: int) -> None:
-        """Pause, and move forward by `frames`, or back if negative. Stop at the first or last frame that is kept."""
+        """Pause, and move forward by `frames`, or back if negative, as far as frames are kept."""
         if (frame := self.frame) is not None:
             found = self._feed.frame(frame.at + frames)
             self.at = found.at if found is not None else None
@@ -99,7 +99,7 @@ def _in_words(reading: list[Any], unit: str, states: tuple[str, ...]) -> list[An
 
 
 def packed(head: dict[str, Any], picture: bytes = b"") -> bytes:
-    """Return the bytes of a message that consists of a head and a picture."""
+    """Return a message with this head and picture."""
     # NaN would be no JSON; orjson writes null
     text = orjson.dumps(head, option=orjson.OPT_SERIALIZE_NUMPY)
     return b"".join((_LENGTH.pack(len(text)), text, picture))

@@ -50,7 +50,7 @@ ANSWER_TIME = 60.0
 """Seconds that a service may take beyond its own timeouts before the master treats it as stuck."""
 
 COMPILING_TIME = 60.0
-"""Additional seconds for boards that the master starts, because they may first have to compile their kernels."""
+"""Additional seconds for boards that the master starts, because they may first compile their kernels."""
 
 _CONNECT_EVERY = 0.01
 _WATCH_EVERY = 1.0
@@ -97,10 +97,7 @@ class Peer:
 
 @dataclass(frozen=True, slots=True)
 class Awaited:
-    """A step that a peer has to take in time.
-
-    `what` describes the step. The wait began at `since` (monotonic seconds), and may take `limit` seconds.
-    """
+    """A step that a peer has to take within `limit` seconds from the time `since` (monotonic, s)."""
 
     what: str
     since: float
@@ -112,26 +109,26 @@ class PeerEvents(Protocol):
 
     @property
     def is_idle(self) -> bool:
-        """True while no frame is in progress. A frame is in progress from its reading to its outcome."""
+        """True while no frame is in progress."""
 
     def ready(self, peer: Peer) -> None:
         """Handle a peer that has become ready."""
 
     def received(self, peer: Peer, record: AnyRecord) -> None:
-        """Handle a record that a peer has sent about a reading, a frame or a result."""
+        """Handle a record about a reading, a frame or a result."""
 
     def lost(self, peer: Peer) -> None:
         """Handle the loss of a connection to a peer, and count the frame or the results that are lost."""
 
     def awaited(self, peer: Peer) -> Awaited | None:
-        """Return the step that a ready peer has to take next, or None if it has to take none."""
+        """Return the step that a ready peer has to take next, or None."""
 
     def fail(self, error: Exception) -> None:
         """End the run."""
 
 
 class Peers:
-    """The three services that the master uses, and the process of the boards if the master starts this process."""
+    """The three services, and the boards' process if the master starts the boards."""
 
     def __init__(self, settings: Settings, deployment: Deployment, log: Logger, *, once: bool) -> None:
         self._settings = settings
@@ -259,7 +256,7 @@ class Peers:
         return 0.0 if self._boards is None else COMPILING_TIME
 
     async def start(self, events: PeerEvents) -> None:
-        """Start processes that do not run yet, and connect to all services. From then on, restore lost connections."""
+        """Start peers that are not running, and connect to all peers. From then on, restore lost connections."""
         self._events = events
         if self._boards is not None:
             await self._boards.start()
@@ -306,7 +303,7 @@ class Peers:
             self._begin_task(service, inside=True)
 
     async def leave(self) -> None:
-        """Stop restoring lost connections, and wait up to `stop_timeout` for the end of services in this process."""
+        """Stop restoring lost connections, and give services in this process a grace period to end."""
         for task in (*self._tasks, *self._inside):
             task.cancel()
         if self._inside:

@@ -1,6 +1,6 @@
-"""Output of frames on standard output. Each frame becomes a line, a JSON object or a picture.
+"""Output of frames on standard output, each as a line, a JSON object or a picture.
 
-A picture has bars for one dimension, or is a heat map for two dimensions. It may have colour.
+A picture of one dimension has bars. A picture of two dimensions is a heat map.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ _WORDS: Final = 7
 """Number of terminal lines reserved for the text around a picture."""
 
 ROWS: Final = 32
-"""Maximum number of terminal lines in a picture. A posterior with more cells is drawn in blocks of cells."""
+"""Maximum number of terminal lines in a picture. Finer posteriors are drawn in blocks of cells."""
 WIDTH: Final = 160
 """Maximum width of a picture in characters."""
 _SHADES: Final = " .:-=+*#%@"
@@ -136,10 +136,10 @@ def drawing() -> Iterator[Show]:
 
 
 def picture(posterior: Posterior, axes: list[Axis], *, width: int, colour: bool, rows: int = ROWS) -> Text:
-    """Return a picture of a posterior, at most `width` columns wide, with at most `rows` lines besides its text.
+    """Draw a posterior with at most `width` columns and `rows` lines, plus text.
 
-    Without colour, characters stand for the probabilities. Of three or more dimensions, the picture shows the two with
-    the most cells, and all other dimensions are summed out.
+    Without colour, characters show the probabilities. Of three or more dimensions, the two longest are drawn, and the
+    others are summed out.
     """
     # the words around the picture stay on the screen
     width, rows = min(width, WIDTH), max(min(rows, ROWS), 2)

@@ -1,6 +1,6 @@
 """The clock for stamps and ages of readings.
 
-With `use_sim_time`, it is the clock of a simulation on `/clock`. Otherwise it is the clock of this computer.
+With `use_sim_time`, it is a simulation's clock on `/clock`, otherwise this computer's clock.
 """
 
 import time
@@ -19,7 +19,7 @@ _MOST_NS: Final = 3600 * 10**9
 
 
 class Clock:
-    """A clock with a time for stamps, and with ticks for ages.
+    """A clock with times for stamps, and ticks for ages.
 
     A simulation runs at any rate, and may pause or restart. A restart sets the time back, but never the ticks.
     """
@@ -41,7 +41,7 @@ class Clock:
         return self._tick if self.simulated else time.monotonic_ns()
 
     async def follow(self, ros: Ros, moved: Callable[[], None] | None = None) -> None:
-        """Take the time from `/clock` until cancelled, and call `moved` after each message with a valid time."""
+        """Take the time from `/clock` until cancelled, and call `moved` after each message."""
         messages = ros.subscribe(
             CLOCK_TOPIC, _CLOCK_TYPE, throttle_rate=_INTERVAL_MS, queue_length=1, queue_size=1
         )

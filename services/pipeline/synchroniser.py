@@ -100,7 +100,7 @@ class Synchroniser(Generic[Item]):
         self._done = -1
 
     def add(self, at: int, stamp: int, tick: int, item: Item) -> None:
-        """Add a message of the topic with the index `at`, received at `tick` (ns)."""
+        """Add a message of the topic with the index `at`."""
         if self._begun is None:
             self._begun = tick
         topic = self._topics[at]

@@ -62,10 +62,7 @@ class CheckedChain:
         return tuple(f"CDE {at} ({scope})" for at, scope in enumerate(scopes))
 
     def state(self, values: Sequence[int], variables: Sequence[int]) -> str:
-        """Return a part of a state as text: `rain = yes, grass = wet`.
-
-        `values` has the values of all variables, and `variables` has the indices of the variables to show.
-        """
+        """Return the values of the variables at the indices `variables` as text: `rain = yes, grass = wet`."""
         p, deployment = self.machine.parameters, self.deployment
         if self.model is None:
             labels = dict(zip(p.known, (each.states for each in deployment.variables), strict=True))
@@ -228,9 +225,9 @@ def legal_states(machine: BM2Machine) -> NDArray[np.bool_]:
 def unconnected(
     machine: BM2Machine, legal: NDArray[np.bool_], known: Sequence[int]
 ) -> tuple[int, int] | None:
-    """Return two legal states that no series of single-bit moves connects, or None if there is no such pair.
+    """Return two legal states that no moves through legal states connect, or None if there are none.
 
-    All moves go through legal states. Both states have equal values of the variables with the indices `known`.
+    Both states have equal values of the variables at the indices `known`.
     """
     p, index = machine.parameters, np.arange(len(legal))
     mask = sum(p.masks[variable] for variable in known)

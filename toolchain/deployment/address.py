@@ -1,7 +1,6 @@
 """The conversion of a reading to an address of its column, in plain Python.
 
-`address = floor((value - offset) / step + 0.5)`. For a periodic variable, the address is then taken modulo `period`.
-The range check comes last.
+`address = floor((value - offset) / step + 0.5)`, modulo `period` if the variable has one. The range check comes last.
 """
 
 import math

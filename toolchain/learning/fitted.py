@@ -1,7 +1,4 @@
-"""Fit files, and the use of their learnt parameters in models.
-
-A fit of normal distributions is a `.toml` file, and a fit of counted tables is an `.npz` file.
-"""
+"""Fit files, which are `.toml` for normal distributions and `.npz` for counted tables, and their use in models."""
 
 import json
 import math
@@ -78,7 +75,7 @@ class Fit:
 
     file: FitFile
     tables: Mapping[str, NDArray[np.float64]]
-    """Tables P(K | S), float64[values, lines], by the variable's name. Empty unless the method is `counts`."""
+    """P(K | S), float64[values, lines], by the variable's name. Empty unless the method is `counts`."""
     prior: NDArray[np.float64] | None = None
     """P(S), float64[lines], or None if no prior was learnt. Only the method `counts` can learn a prior."""
 
@@ -197,7 +194,7 @@ def write_fit(path: Path, fit: Fit) -> None:
 
 
 def read_fit(path: Path) -> Fit:
-    """Return the fit in a file that `toolchain fit` has written, or raise a ModelError."""
+    """Return a fit that `toolchain fit` has written, or raise a ModelError."""
     if path.suffix == ".npz":
         return _read_tables(path)
     file = TomlFile.read(path, ModelError).validated(FitFile)

@@ -1,8 +1,8 @@
 """The model for a BM1: a searched variable S on a grid, and known variables that depend on S (thesis 2.1.2).
 
-The machine computes P(S | k_1 ... k_N), which is proportional to P(S) P(k_1 | S) ... P(k_N | S) (equation 2.2). A
+The machine computes P(S | k_1 ... k_N), proportional to P(S) P(k_1 | S) ... P(k_N | S) (equation 2.2). A
 model consists of the prior P(S) and a table P(K_i | S) for each known variable, in the order of the columns.
-`exact_posterior` computes the posterior in float64, as the reference for the posterior of a machine.
+`exact_posterior` computes the posterior in float64, as the reference for a machine.
 """
 
 import math
@@ -21,15 +21,9 @@ from toolchain.deployment.sections import NAME_MAX
 from toolchain.errors import ModelError
 
 MAX_LINES: Final = 2**24
-"""Maximum number of lines of a model. The number of lines is the product of the searched dimensions' sizes.
-
-4,096 boards have this number of lines if each board has as many lines as the register map permits.
-"""
+"""Maximum number of values of the searched variable: 4,096 boards with the register map's maximum number of lines."""
 MAX_VALUES: Final = 2**16 - 1
-"""Maximum number of values of a known variable.
-
-A column has at most 16 address bits, and the top address stands for a missing reading.
-"""
+"""Maximum number of values of a known variable: all addresses of 16 bits, except the top one for a missing reading."""
 MAX_ENTRIES: Final = 2**24
 """Maximum number of entries of a factor of a joint distribution (128 MiB as float64)."""
 MAX_TABLE_ENTRIES: Final = 2**26
@@ -39,7 +33,7 @@ MAX_MODEL_ENTRIES: Final = 2**28
 
 
 def check_size(what: str, entries: int, most: int, advice: str = "") -> None:
-    """Raise a ModelError if `entries` is larger than `most`. The error names `what`, and ends with `advice`."""
+    """Raise a ModelError about `what` if `entries` exceeds `most`."""
     if entries > most:
         raise ModelError(f"{what} would have {entries} entries; the maximum is {most}{advice}")
 
@@ -77,19 +71,19 @@ class TabulatedVariable:
     offset: float = 0.0
     """The reading with address 0, in the unit of the variable."""
     step: float = 1.0
-    """Difference between the readings of adjacent addresses, in the unit of the variable."""
+    """Difference between readings of adjacent addresses, in the unit of the variable."""
     unit: str = ""
     """The unit of the variable's readings, such as `m`, for display."""
     period: int | None = None
     """Number of addresses in one turn of a cyclic reading, such as a bearing, or None for other readings."""
     on_range: Literal["error", "clamp", "missing"] = "error"
-    """What a reading out of range becomes: an error, the nearest end of the range, or a missing reading."""
+    """What a reading out of range becomes: an error, the nearest end, or a missing reading."""
     on_missing: Literal["error", "missing"] = "error"
     """`missing` if a reading may be missing."""
     path: str = ""
-    """Path of the variable's field in the message. If it is empty, the message is searched for a field `name`."""
+    """Path of the variable in the message. If the path is empty, the message is searched for the name."""
     states: tuple[str, ...] = ()
-    """Names of the values, or () without names. A reading may be a name instead of a number."""
+    """Names of the values, or () without names. A reading may be a name."""
 
     def _keep_table(self, what: str) -> None:
         """Store a read-only copy of the table, and choose the number of address bits if it is 0."""
@@ -134,7 +128,7 @@ class Known(TabulatedVariable):
     Quantising warns if the codes cannot express the minimum.
     """
     normal: Normal | None = field(default=None, repr=False)
-    """The normal distributions from which the table was computed, or None for a table from another source."""
+    """The normal distributions from which the table was computed, or None."""
 
     def __post_init__(self) -> None:
         what = f"P({self.name} | S)"
@@ -172,7 +166,7 @@ class Model:
     None means a uniform prior. With `prior_select`, None means the mean of the rows of its table.
     """
     prior_select: PriorSelect | None = None
-    """The variable that selects the prior, or None. `prior` applies while the reading of this variable is missing."""
+    """The variable that selects the prior, or None. While its reading is missing, `prior` applies."""
     transition: Transition | None = None
     """The transition of the searched variable between frames, or None without a filter.
 
@@ -309,7 +303,7 @@ def cell_centres(*searched: Dimension) -> tuple[NDArray[np.float64], ...]:
 
 
 def check_table(what: str, values: int, lines: int) -> None:
-    """Raise a ModelError if a known variable's table with `values` rows and `lines` columns would be too large."""
+    """Raise a ModelError if a known variable's table of this size would be too large."""
     if values > MAX_VALUES:
         raise ModelError(
             f"{what} has {values} values; a column supports at most {MAX_VALUES}: use a larger step"

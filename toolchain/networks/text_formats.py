@@ -17,13 +17,13 @@ _SHOWN: Final = 40
 
 
 class Scanner:
-    """A scanner of words, signs and numbers. Its methods raise a NetworkFileError for an unexpected token."""
+    """A forward scanner. Its methods raise a NetworkFileError for an unexpected token."""
 
     def __init__(self, data: bytes, path: Path, *, signs: str = "{}()[]|;,", comments: str) -> None:
-        """Start at the beginning of a file.
+        """Scan the bytes of a file.
 
-        Each character of `signs` is a token, and ends a word. `comments` is a regular expression for comments. Of a
-        comment /* ... */, the expression matches only the beginning.
+        Each character of `signs` is a token, and ends a word. `comments` is a regular expression for comments. It
+        matches only the beginning of a comment /* ... */.
         """
         self._path = path
         try:
@@ -81,7 +81,7 @@ class Scanner:
         return found
 
     def words(self, end: str, what: str, most: int) -> list[str]:
-        """Consume at most `most` words and the sign `end`, and return the words. Commas between words are optional."""
+        """Consume and return at most `most` words up to the sign `end`. Commas between words are optional."""
         found: list[str] = []
         while True:
             piece = self.next()
@@ -96,7 +96,7 @@ class Scanner:
             found.append(piece)
 
     def scope(self, what: str, most: int) -> tuple[str, list[str]]:
-        """Consume `( CHILD | PARENTS )` or `( CHILD )`, and return child and parents. Errors call the child `what`."""
+        """Consume `( CHILD | PARENTS )` or `( CHILD )`. Errors call the child `what`."""
         self.sign("(")
         child = self.word(what)
         separator = self.next()
@@ -105,7 +105,7 @@ class Scanner:
         return child, self.words(")", "parents", most) if separator == "|" else []
 
     def count(self, what: str, most: int) -> int:
-        """Consume and return a whole number from 0 to `most`. Errors call the number `what`."""
+        """Consume and return a whole number from 0 to `most`."""
         word = self.word(what)
         if not (word.isascii() and word.isdigit() and len(word) <= 9) or int(word) > most:
             raise self.error(f"expected {what}, 0 to {most}, found {_shown(word)}")
@@ -126,7 +126,7 @@ class Scanner:
         return self._floats(piece.split(maxsplit=wanted), wanted, what, begin)
 
     def next_numbers(self, wanted: int, what: str) -> NDArray[np.float64]:
-        """Consume and return `wanted` numbers that are separated by white space: float64[wanted]."""
+        """Consume and return numbers separated by white space: float64[wanted]."""
         begin, words = self._end, []
         for _ in range(wanted):
             word = self.next()
@@ -206,8 +206,8 @@ _BIF_COMMENTS: Final = r"//[^\n]*|/\*"
 def read_bif(data: bytes, builder: NetworkBuilder) -> None:
     """Read a BIF file into a builder.
 
-    In a `table`, the child varies slowest and the last parent fastest. `(a, b) ...` defines the row for the states `a`
-    and `b` of the parents, and `default ...` defines all other rows.
+    In a `table`, the child varies slowest and the last parent fastest. `(a, b) ...` defines the row for the parents'
+    states a and b, and `default ...` all other rows.
     """
     text = Scanner(data, builder.path, comments=_BIF_COMMENTS)
     while (block := text.next()) or text.quoted:
