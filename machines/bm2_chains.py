@@ -2,8 +2,8 @@
 
 Chains of a small network are bit-sliced: bit i of every vector belongs to chain i. A cycle is a list of logical
 operations on vectors. A context is one choice of values for the other bits of a factor. Each CDE makes a bit for every
-context, and each chain takes the bit for its own context. A bit of the state is written in the chains that point at
-this bit.
+context, and each chain takes the bit for its own context. Each chain has a pointer to the bit that its sequencer
+draws now. A new value of a bit is written only in the chains whose pointer is at this bit.
 
 Chains of a large network go in step: all chains make a move together, but each chain takes its own number of cycles.
 Vector operations search 8 chains at a time for the first cycle in which the CDEs agree. Other chains run one by one.

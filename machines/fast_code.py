@@ -280,7 +280,10 @@ def _count(words: Words, places: npt.NDArray[np.uint32], line: int, width: int, 
 def fill_blocks(
     generators: Generators, store: _Store, frame: _Frame, first_slot: int, blocks: int, period: int
 ) -> None:
-    """Compute the words of all codes in the first blocks of a seed bank. `frame.starts` has the bank's start states."""
+    """Cache the words of all codes for the first blocks of cycles after a restart from a seed bank.
+
+    The words go to the slots from `first_slot` on. `frame.starts` has the states of the generators at the restart.
+    """
     for block in range(blocks):
         words = store.words[first_slot + block]
         filled = store.filled[first_slot + block]

@@ -114,5 +114,5 @@ class Dispatcher:
 
 
 def fragment_size_of(requested: float) -> int:
-    """Return the fragment size for a client's request, at least `SMALLEST_FRAGMENT`. 0 means whole messages."""
+    """Return the requested fragment size, raised to `SMALLEST_FRAGMENT` if it is smaller; 0 (no fragments) stays 0."""
     return max(int(requested), SMALLEST_FRAGMENT) if requested else 0

@@ -5,7 +5,7 @@ A service accepts one master at a time:
 master ──connects──▶ service   a second master is refused with `Trouble`
        ◀───Hello────           role, version, deployment
        ────Hello───▶           a difference is refused with `Trouble`
-       ◀─Notice, Ready         stored notices, and lasting states
+       ◀─Notice, Ready         notices not yet sent, and the current state
        ◀──records──▶
 """
 

@@ -73,9 +73,9 @@ class Difference:
     Attributes:
         total_variation: Half the sum of absolute differences, from 0 to 1. A frame without a posterior counts as 1.
         map_agreement: Share of all frames in which both posteriors exist and have an equal most probable line.
-        kl_bits: KL(ours || theirs) in bits, or None outside of `alone`, because frames without a posterior have no
-            KL. The opposite direction, KL(theirs || ours), would be infinite if a count is 0.
-        alone: The distances averaged over only the frames with a posterior, or None if no frame has a posterior.
+        alone: A second `Difference`, averaged over only the frames with a posterior, or None if no frame has one.
+        kl_bits: KL(ours || theirs) in bits. Only `alone` has it, because a frame without a posterior has no KL;
+            elsewhere it is None. The opposite direction, KL(theirs || ours), is infinite if a count is 0.
     """
 
     total_variation: Interval

@@ -248,10 +248,11 @@ def fitted_layout(
     what: str,
     advice: str = "",
 ) -> BoardLayout:
-    """Return the layout of boards, or raise a BuildError if the boards, interface and register map do not fit.
+    """Return the layout of boards, with an interface of the size `asked` (inputs, results).
 
-    `asked` is the wanted size; None stands for the size that `used` needs. In errors, `what` describes a board. If a
-    board does not fit the register map, the error ends with `advice`.
+    If `asked` is None, the interface has the size that `used` needs. Raises a BuildError if a board does not fit the
+    interface, or the interface does not fit the register map. In errors, `what` describes a board. If a board does not
+    fit the register map, the error ends with `advice`.
     """
     needed, room = (used.input_words, used.result_words), interface_room(used)
     sentence = f"a board needs {counted(needed[0], 'input')} and {counted(needed[1], 'result')} ({what})"

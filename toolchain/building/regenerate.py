@@ -81,9 +81,9 @@ def regenerate_memories(
     """Write the memory files again, and for a BM1 also `bm1_parameters.vhd`.
 
     Without a model, the tables come from the images. If a model is given, `flags` are the flags with which it was read.
-    The function then computes the tables from the model, and also writes the report, the hashes of `deployment.toml`
-    and the images with the date `build_date`. The columns get the order of the model. Sizes, widths, topics and paths
-    in messages do not change.
+    The function then computes the tables from the model. It also writes the report, the images (dated `build_date`),
+    and the hashes in `deployment.toml`. The columns get the order of the model. Sizes, widths, topics and paths in
+    messages do not change.
 
     Raises:
         BuildError: The model now needs another machine, so a new build is necessary.

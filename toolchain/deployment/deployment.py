@@ -192,7 +192,7 @@ class Deployment(DeploymentFile):
         return self.directory / self.boards[board].image
 
     def new_filter(self) -> "Filter | None":
-        """Return the filter in the file of `[filter]`, or None without this section. May raise a DeploymentError."""
+        """Return the filter in the file of the section `[filter]`, or None without it. May raise a DeploymentError."""
         if self.filter is None:
             return None
         # here, because a subscriber loads a deployment without NumPy
