@@ -160,7 +160,7 @@ def parse_path(path: str) -> Place:
 
 
 def format_place(place: Place) -> str:
-    """Return the path of a place."""
+    """Return a place as a path, such as `pose.position.x` or `ranges[3]`."""
     text = ""
     for step in place:
         text += f"[{step}]" if isinstance(step, int) else f".{step}" if text else step

@@ -55,7 +55,7 @@ class Client:
     status_lane: Lane | None = None
     """The queue of status messages to the client, or None before the first status message."""
     last_published: "Advertisement | None" = None
-    """The advertisement of the client's last message with a known envelope. The hub tries it first the next time."""
+    """The advertisement of the client's last message with a known envelope. Its envelope is the first to be tried."""
     envelopes: dict[bytes, "Advertisement"] = field(default_factory=dict)
     """The client's advertisements by envelope: the bytes of a publish operation before the message."""
     close_reason: str = ""

@@ -192,7 +192,7 @@ class ChainError:
     worst_reading: tuple[int, ...]
     """The reading with the distance `worst`: one address per known variable."""
     start: float
-    """Mean distance of a frame's expected posterior from the stationary law's: the start's effect after burn-in."""
+    """Mean distance of a frame's expected posterior from that of the stationary law: the start state's effect."""
     sampling: float
     """Mean distance of a frame's posterior from its expected value, because the samples are few and correlated."""
     cycles: float

@@ -440,7 +440,7 @@ class Output(Section):
 
 
 class TopicsSection(Section):
-    """`[topics]`: whether to publish each topic for robot tools. None: if the topic fits the searched variables."""
+    """`[topics]`: whether to publish each topic for robot tools; with None, if it fits the searched variables."""
 
     counts: bool | None = None
     posterior: bool | None = None

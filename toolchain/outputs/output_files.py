@@ -95,7 +95,7 @@ class Change(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class OutputFiles:
-    """The files of a part of a deployment, for example of its MIFs, and a pattern for files of earlier builds."""
+    """The files of one part of a deployment, such as all MIFs, and a pattern that finds this part's outdated files."""
 
     contents: dict[str, Iterable[bytes]]
     """The pieces of each file's content, by the file's path in the deployment. Pieces may be iterated only once."""
