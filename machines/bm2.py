@@ -62,7 +62,7 @@ class BM2StopReason(IntEnum):
     PAUSED = 3
     """The machine paused after the cycle `pause_at`. `step` continues the run."""
     IMPOSSIBLE = 4
-    """The machine did not run, because the frame asked for 0 samples: no state agrees with the evidence."""
+    """The machine did not run: no state agrees with the evidence, so the host asked for 0 samples."""
     OPS_TIMEOUT = 5
     """In a move, the CDEs of a bit's factors did not agree on the bit within `ops_timeout` cycles."""
     FULL = 6

@@ -280,9 +280,9 @@ def _count(words: Words, places: npt.NDArray[np.uint32], line: int, width: int, 
 def fill_blocks(
     generators: Generators, store: _Store, frame: _Frame, first_slot: int, blocks: int, period: int
 ) -> None:
-    """Cache the words of all codes for the first blocks of cycles after a restart from a seed bank.
+    """Fill the cache for the first `blocks` blocks of cycles after a restart from a seed bank.
 
-    The words go to the slots from `first_slot` on. `frame.starts` has the states of the generators at the restart.
+    Block i goes to slot `first_slot` + i. `frame.starts` has the states of the generators at the restart.
     """
     for block in range(blocks):
         words = store.words[first_slot + block]

@@ -36,7 +36,7 @@ def raise_on_signals() -> None:
 
     A second signal is ignored, because the clean-up after the first signal always ends within a limited time.
 
-    Before code blocks, it must call `check_signals`, as `run_async` does, because the exception can be lost. Python
+    Code must call `check_signals` before it blocks, as `run_async` does, because the exception can be lost. Python
     drops the exception while the thread runs a callback from C code, forks, or runs a finaliser. C code may print the
     exception and raise another exception, as numba does while it is imported.
     """

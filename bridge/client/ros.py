@@ -326,9 +326,9 @@ class Ros:
             type: Type of the action: `example_interfaces/action/Fibonacci` or `example_interfaces/Fibonacci`.
             handler: Coroutine function that executes a goal. The client calls the handler with each goal, up to 64
                 goals concurrently. The handler may send feedback, and should check whether the goal has been
-                cancelled. The returned fields become the goal's result, unless the handler has already ended
-                the goal. The goal then counts as cancelled if the sender asked for that, and otherwise as
-                succeeded. If the handler raises an error, the goal is aborted, and the error is logged. A
+                cancelled. If the handler returns without having ended the goal, the returned fields become the
+                goal's result. The goal then counts as cancelled if the sender asked for that, and otherwise
+                as succeeded. If the handler raises an error, the goal is aborted, and the error is logged. A
                 result or feedback that does not fit the type is such an error. Handlers are cancelled when the
                 connection is lost.
 

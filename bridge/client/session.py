@@ -88,7 +88,7 @@ class Reader(Protocol):
         """Count a message that was discarded because it is larger than `max_bytes`."""
 
     def leave_out(self, reason: str) -> None:
-        """Note that the client leaves the topic out, because a message was too large. Reading then raises an error."""
+        """Record that the client leaves the topic out after too large a message. Reading then raises an error."""
 
     def add_blind_seconds(self, seconds: float) -> None:
         """After a reconnection, add the seconds without a connection to `blind_seconds`."""

@@ -90,11 +90,11 @@ class DeployedBoards:
             raise
 
     def post(self, frame: FrameRequest) -> None:
-        """Start a frame, whose result `collect` returns. If this call raises a BoardError, call `find_lost_boards`."""
+        """Start a frame, whose result `collect` returns. The caller must call `find_lost_boards` after a BoardError."""
         self._whole_cluster().post(self._input(frame))
 
     def collect(self) -> FrameOutput | None:
-        """Return the posted frame's result, or None while boards run. On a BoardError, call `find_lost_boards`."""
+        """Return the posted frame's result, or None while boards run; see `post` about BoardErrors."""
         return self._whole_cluster().collect(0)
 
     @property

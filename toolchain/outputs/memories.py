@@ -212,7 +212,7 @@ def _seeds(machine: BM1Machine | BM2Machine, prefix: str, address: str) -> list[
 
 
 def generators(parameters: BM1Parameters | BM2Parameters) -> int:
-    """Return the number of generators on a board. Each column, each cell or each CDE has one generator."""
+    """Return a board's number of generators: one per column or per cell of a BM1, one per CDE of a BM2."""
     return math.prod(parameters.generator_shape)
 
 

@@ -271,7 +271,7 @@ class Subscriptions:
         return bool(waiting)
 
     def silent(self) -> list[str]:
-        """Return the topics without a message on this connection, out of the topics subscribed to with a type."""
+        """Return the topics subscribed to with a type that have delivered no message on this connection."""
         return [
             s.topic
             for s in self._subscribed.values()
