@@ -15,33 +15,33 @@ entity bm1_matrix is
   generic (
     LINES         : positive;        -- number of lines on this board
     SENSORS       : natural;         -- number of sensor columns
-    MODE          : sensor_mode_t;   -- input of the cells in a sensor column
-    ADDRESS_BITS  : natural_array_t; -- address widths of the sensor columns (index 1 to SENSORS)
+    MODE          : sensor_mode_t;   -- kind of input that the cells of a sensor column get
+    ADDRESS_BITS  : natural_array_t; -- address width of each sensor column, from 1 to SENSORS
     PROB_BITS     : positive;        -- width of a probability code
     PRIOR_BITS    : natural;         -- width of the prior's address
-    WRITTEN       : boolean;         -- true: the host writes the prior; false: it is a table
+    WRITTEN       : boolean;         -- true: the host writes the prior; false: the prior is a table
     COUNTER_BITS  : positive;        -- width of a counter
-    RNG_SHARED    : boolean;         -- one random number per column; otherwise one per cell
-    MEMORY_PREFIX : string           -- start of the MIFs' file names: folder and board
+    RNG_SHARED    : boolean;         -- true: one random number per column; false: one per cell
+    MEMORY_PREFIX : string           -- start of the MIFs' paths: the folder and the board
   );
   port (
     clk_i : in    std_logic; -- clock
     -- control
-    load_i       : in    std_logic;                                   -- latch the codes of the frame
+    load_i       : in    std_logic;                                   -- latch the codes for the frame's inputs
     clear_i      : in    std_logic;                                   -- clear the counters
     enable_i     : in    std_logic;                                   -- run a cycle
     target_i     : in    std_logic_vector(COUNTER_BITS - 1 downto 0); -- target count
     overflow_o   : out   std_logic;                                   -- a counter is at the target
-    impossible_o : out   std_logic;                                   -- every line has a code 0
+    impossible_o : out   std_logic;                                   -- every line has a cell with the code 0
     -- inputs of the frame
-    prior_i       : in    std_logic_vector(SLOT_BITS - 1 downto 0);                                            -- address of the prior
-    prior_codes_i : in    std_logic_vector(LINES * SLOT_BITS - 1 downto 0);                                    -- written prior, line 0 lowest
-    inputs_i      : in    std_logic_vector(SENSORS * inputs_per_column(MODE, LINES) * SLOT_BITS - 1 downto 0); -- by column
+    prior_i       : in    std_logic_vector(SLOT_BITS - 1 downto 0);                                            -- address in the prior's table
+    prior_codes_i : in    std_logic_vector(LINES * SLOT_BITS - 1 downto 0);                                    -- prior codes, line 0 lowest
+    inputs_i      : in    std_logic_vector(SENSORS * inputs_per_column(MODE, LINES) * SLOT_BITS - 1 downto 0); -- inputs, column 1 lowest
     -- random numbers
     randoms_i : in    std_logic_vector(
-      (SENSORS + 1) * (LINES + to_natural(RNG_SHARED) * (1 - LINES)) * PROB_BITS - 1 downto 0); -- generator 0 lowest
+      (SENSORS + 1) * (LINES + to_natural(RNG_SHARED) * (1 - LINES)) * PROB_BITS - 1 downto 0); -- random numbers, generator 0 in the low bits
     -- results
-    counts_o : out   std_logic_vector(LINES * COUNTER_BITS - 1 downto 0) -- counters, line 0 lowest
+    counts_o : out   std_logic_vector(LINES * COUNTER_BITS - 1 downto 0) -- counters, line 0 in the low bits
   );
 end entity bm1_matrix;
 

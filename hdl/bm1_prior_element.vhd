@@ -10,11 +10,11 @@ library ieee;
 entity bm1_prior_element is
   generic (
     PROB_BITS : positive; -- width of a probability code
-    WRITTEN   : boolean   -- the host writes the codes; otherwise they come from the prior's table
+    WRITTEN   : boolean   -- true: the host writes the code; false: the code is in the prior's table
   );
   port (
     clk_i    : in    std_logic;                                -- clock
-    load_i   : in    std_logic;                                -- a frame starts: latch the written code
+    load_i   : in    std_logic;                                -- latch the written code at the start of a frame
     code_i   : in    std_logic_vector(PROB_BITS - 1 downto 0); -- code from the prior's table, or from the host
     random_i : in    std_logic_vector(PROB_BITS - 1 downto 0); -- random number of column 0
     bit_o    : out   std_logic;                                -- bitstream of P(S)
