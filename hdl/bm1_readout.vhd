@@ -10,18 +10,18 @@ library ieee;
 
 entity bm1_readout is
   generic (
-    RESULTS      : positive; -- counters of all replicas
+    RESULTS      : positive; -- number of counters, all replicas together
     COUNTER_BITS : positive; -- width of a counter
-    REPLICAS     : positive  -- number of replicas: machines that share the generators
+    REPLICAS     : positive  -- number of replicas (machines that share the generators)
   );
   port (
     clk_i     : in    std_logic;                                             -- clock
-    index_i   : in    std_logic_vector(11 downto 0);                         -- index of the word; OUTCOMES uses 10 bits
-    counts_i  : in    std_logic_vector(RESULTS * COUNTER_BITS - 1 downto 0); -- counters, the first lowest
+    index_i   : in    std_logic_vector(11 downto 0);                         -- index of a counter or of a word of OUTCOMES (10 bits)
+    counts_i  : in    std_logic_vector(RESULTS * COUNTER_BITS - 1 downto 0); -- counters; counter 0 in the lowest bits
     reasons_i : in    std_logic_vector(3 * REPLICAS - 1 downto 0);           -- stop reasons of the replicas
-    cycles_i  : in    std_logic_vector(64 * REPLICAS - 1 downto 0);          -- cycles of the replicas
-    result_o  : out   std_logic_vector(31 downto 0);                         -- counter, one clock after its index
-    outcome_o : out   std_logic_vector(31 downto 0)                          -- word of OUTCOMES, one clock after its index
+    cycles_i  : in    std_logic_vector(64 * REPLICAS - 1 downto 0);          -- numbers of cycles of the replicas
+    result_o  : out   std_logic_vector(31 downto 0);                         -- counter at index_i, one clock later
+    outcome_o : out   std_logic_vector(31 downto 0)                          -- word of OUTCOMES at index_i, one clock later
   );
 end entity bm1_readout;
 

@@ -13,9 +13,9 @@ entity bm1_stochastic_bitstream_generator is
     PROB_BITS : positive -- width of a probability code
   );
   port (
-    random_i : in    std_logic_vector(PROB_BITS - 1 downto 0); -- output of the generator
-    code_i   : in    std_logic_vector(PROB_BITS - 1 downto 0); -- 0: never; all ones: always
-    bit_o    : out   std_logic;                                -- one bit of the stream
+    random_i : in    std_logic_vector(PROB_BITS - 1 downto 0); -- random number from the generator
+    code_i   : in    std_logic_vector(PROB_BITS - 1 downto 0); -- probability code; 0 gives no 1s, all ones gives only 1s
+    bit_o    : out   std_logic;                                -- random bit
     never_o  : out   std_logic                                 -- the code is 0
   );
 end entity bm1_stochastic_bitstream_generator;

@@ -17,15 +17,15 @@ entity bm1_table_player is
     PROB_BITS  : positive; -- width of a random number
     TABLE_FILE : string;   -- MIF of the random numbers
     LENGTH     : positive; -- number of entries in the table
-    STEPS      : positive  -- entries by which the index advances per clock
+    STEPS      : positive  -- number of entries by which the index advances per clock
   );
   port (
     clk_i    : in    std_logic;                                 -- clock
-    shift_i  : in    std_logic;                                 -- shift the seed in
-    seed_i   : in    std_logic_vector(STATE_BITS - 1 downto 0); -- seed from the memory or the previous generator
-    step_i   : in    std_logic;                                 -- make the steps of a cycle
+    shift_i  : in    std_logic;                                 -- load seed_i into the index
+    seed_i   : in    std_logic_vector(STATE_BITS - 1 downto 0); -- seed from the seed memory or the previous generator
+    step_i   : in    std_logic;                                 -- advance the index by STEPS
     state_o  : out   std_logic_vector(STATE_BITS - 1 downto 0); -- index in the table
-    random_o : out   std_logic_vector(PROB_BITS - 1 downto 0)   -- entry at that index
+    random_o : out   std_logic_vector(PROB_BITS - 1 downto 0)   -- entry of the table at index state_o
   );
 end entity bm1_table_player;
 

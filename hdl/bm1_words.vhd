@@ -1,6 +1,6 @@
 -- ================================================================================================
 -- rosbayes: bm1_words
--- Memory of words from the host: outputs all used words in parallel, and whether one is too large.
+-- Stores words from the host, outputs the used words in parallel, and reports too large words.
 -- MIT licence; datasheet: docs/hardware/bm1_words.md
 -- ================================================================================================
 
@@ -15,23 +15,23 @@ library work;
 entity bm1_words is
   generic (
     DEPTH         : positive;        -- number of words
-    USED          : natural;         -- words that the machine uses, from word 0 on; at most DEPTH
-    WIDTHS        : natural_array_t; -- used bits of the words of each column, 0 to SLOT_BITS
+    USED          : natural;         -- number of words that the machine uses, from word 0 on; at most DEPTH
+    WIDTHS        : natural_array_t; -- for each column, the number of used bits in its words, 0 to SLOT_BITS
     PER_COLUMN    : positive;        -- number of successive words for each column
-    INITIAL_FILE  : string;          -- MIF of the initial words; "": zeros
-    INITIAL_WORDS : positive;        -- words in the MIF; they are repeated up to DEPTH
-    INITIAL_BITS  : positive         -- width of the MIF's words
+    INITIAL_FILE  : string;          -- MIF of the initial words; if empty, these words are 0
+    INITIAL_WORDS : positive;        -- number of words in the MIF; the memory repeats them up to DEPTH
+    INITIAL_BITS  : positive         -- width of a word in the MIF
   );
   port (
     clk_i    : in    std_logic;                                       -- clock
     rst_i    : in    std_logic;                                       -- write the initial words
     busy_o   : out   std_logic;                                       -- the initial words are being written
-    write_i  : in    std_logic;                                       -- write data_i to the word
-    index_i  : in    std_logic_vector(bits_for(DEPTH) - 1 downto 0);  -- index of the word
+    write_i  : in    std_logic;                                       -- write data_i to word index_i
+    index_i  : in    std_logic_vector(bits_for(DEPTH) - 1 downto 0);  -- index of the word to write or read
     data_i   : in    std_logic_vector(31 downto 0);                   -- data to write
-    data_o   : out   std_logic_vector(31 downto 0);                   -- the word, one clock after its index
-    values_o : out   std_logic_vector(USED * SLOT_BITS - 1 downto 0); -- used words, word 0 lowest
-    bad_o    : out   std_logic                                        -- a used word is too large
+    data_o   : out   std_logic_vector(31 downto 0);                   -- word index_i, one clock later
+    values_o : out   std_logic_vector(USED * SLOT_BITS - 1 downto 0); -- used words; word 0 in the lowest bits
+    bad_o    : out   std_logic                                        -- a used word has a 1 beyond its used bits
   );
 end entity bm1_words;
 
