@@ -14,7 +14,7 @@ library work;
 entity bm1_control is
   generic (
     REPLICAS     : positive; -- number of replicas: machines that share the generators
-    COUNTER_BITS : positive; -- width of a counter
+    COUNTER_BITS : positive; -- width of a line's counter
     RESET_BANK   : boolean   -- true: each frame restarts the generators
   );
   port (
@@ -24,24 +24,24 @@ entity bm1_control is
     -- commands, one clock long
     start_i  : in    std_logic; -- start a frame
     resume_i : in    std_logic; -- run the frame's next slice
-    reset_i  : in    std_logic; -- stop and clear
+    reset_i  : in    std_logic; -- stop, and clear counters and cycles
     -- settings
     target_i     : in    std_logic_vector(COUNTER_BITS - 1 downto 0); -- target count; latched by a start
     max_cycles_i : in    std_logic_vector(63 downto 0);               -- maximum cycles; latched by a start
-    run_until_i  : in    std_logic_vector(63 downto 0);               -- end of the slice, 0: none; stable while running
+    run_until_i  : in    std_logic_vector(63 downto 0);               -- cycles at the slice's end (0: no end); stable while running
     halt_i       : in    std_logic_vector(REPLICAS - 1 downto 0);     -- replicas to halt; latched by a resume
     -- matrices
-    overflow_i   : in    std_logic_vector(REPLICAS - 1 downto 0);     -- a counter is at the target
-    impossible_i : in    std_logic_vector(REPLICAS - 1 downto 0);     -- every line has a code 0
+    overflow_i   : in    std_logic_vector(REPLICAS - 1 downto 0);     -- a counter of the replica is at the target
+    impossible_i : in    std_logic_vector(REPLICAS - 1 downto 0);     -- every line of the replica has a code 0
     load_o       : out   std_logic;                                   -- latch the codes of the frame
     clear_o      : out   std_logic;                                   -- clear the counters
-    enable_o     : out   std_logic_vector(REPLICAS - 1 downto 0);     -- run a cycle
+    enable_o     : out   std_logic_vector(REPLICAS - 1 downto 0);     -- replicas that run a cycle
     target_o     : out   std_logic_vector(COUNTER_BITS - 1 downto 0); -- target count of the frame
     -- generators
     seeds_ready_i  : in    std_logic; -- the seeds are loaded
     restart_o      : out   std_logic; -- load seeds
-    restart_bank_o : out   std_logic; -- 1: seeds of the selected bank, 0: of bank 0
-    step_o         : out   std_logic; -- a cycle is run
+    restart_bank_o : out   std_logic; -- 1: load seeds of the selected bank, 0: of bank 0
+    step_o         : out   std_logic; -- 1: a replica runs a cycle
     -- outcome
     running_o         : out   std_logic;                                   -- the machine runs
     done_o            : out   std_logic;                                   -- the machine stops in this clock

@@ -16,43 +16,43 @@ entity bm_register_block is
   port (
     clk_i             : in    std_logic;                      -- clock
     rst_i             : in    std_logic;                      -- reset of the board
-    write_i           : in    std_logic;                      -- write the word; only for allowed accesses
+    write_i           : in    std_logic;                      -- write data_i to the word; the access must be allowed
     read_i            : in    std_logic;                      -- read the word
     word_i            : in    std_logic_vector(7 downto 0);   -- index of the word: address / 4
     data_i            : in    std_logic_vector(31 downto 0);  -- data to write
-    data_o            : out   std_logic_vector(31 downto 0);  -- data read, one clock after read_i
-    liveness_i        : in    std_logic_vector(31 downto 0);  -- what reads of LIVENESS return
-    liveness_o        : out   std_logic_vector(31 downto 0);  -- what was written to LIVENESS
-    programmed_i      : in    std_logic_vector(31 downto 0);  -- what reads of PROGRAMMED return
-    map_hash_i        : in    std_logic_vector(255 downto 0); -- what reads of MAP_HASH return
-    image_hash_i      : in    std_logic_vector(255 downto 0); -- what reads of IMAGE_HASH return
-    cap_machine_i     : in    std_logic_vector(31 downto 0);  -- what reads of CAP_MACHINE return
-    cap_lines_i       : in    std_logic_vector(31 downto 0);  -- what reads of CAP_LINES return
-    cap_total_lines_i : in    std_logic_vector(31 downto 0);  -- what reads of CAP_TOTAL_LINES return
-    cap_line_offset_i : in    std_logic_vector(31 downto 0);  -- what reads of CAP_LINE_OFFSET return
-    cap_partition_i   : in    std_logic_vector(31 downto 0);  -- what reads of CAP_PARTITION return
-    cap_sensors_i     : in    std_logic_vector(31 downto 0);  -- what reads of CAP_SENSORS return
-    cap_widths_i      : in    std_logic_vector(31 downto 0);  -- what reads of CAP_WIDTHS return
-    cap_banks_i       : in    std_logic_vector(31 downto 0);  -- what reads of CAP_BANKS return
-    cap_replicas_i    : in    std_logic_vector(31 downto 0);  -- what reads of CAP_REPLICAS return
-    cap_interface_i   : in    std_logic_vector(31 downto 0);  -- what reads of CAP_INTERFACE return
-    cap_speed_i       : in    std_logic_vector(31 downto 0);  -- what reads of CAP_SPEED return
-    cap_steps_i       : in    std_logic_vector(31 downto 0);  -- what reads of CAP_STEPS return
-    cap_link_i        : in    std_logic_vector(31 downto 0);  -- what reads of CAP_LINK return
-    cap_sensor_bits_i : in    std_logic_vector(511 downto 0); -- what reads of CAP_SENSOR_BITS return
-    control_o         : out   std_logic_vector(31 downto 0);  -- what was written to CONTROL
-    target_count_o    : out   std_logic_vector(31 downto 0);  -- what was written to TARGET_COUNT
-    max_cycles_o      : out   std_logic_vector(63 downto 0);  -- what was written to MAX_CYCLES
-    bank_o            : out   std_logic_vector(31 downto 0);  -- what was written to BANK
-    prior_select_o    : out   std_logic_vector(31 downto 0);  -- what was written to PRIOR_SELECT
-    run_until_o       : out   std_logic_vector(63 downto 0);  -- what was written to RUN_UNTIL
-    start_o           : out   std_logic_vector(31 downto 0);  -- what was written to START
-    resume_o          : out   std_logic_vector(31 downto 0);  -- what was written to RESUME
-    done_i            : in    std_logic_vector(31 downto 0);  -- what reads of DONE return
-    status_i          : in    std_logic_vector(31 downto 0);  -- what reads of STATUS return
-    cycles_i          : in    std_logic_vector(63 downto 0);  -- what reads of CYCLES return
-    compute_ns_i      : in    std_logic_vector(63 downto 0);  -- what reads of COMPUTE_NS return
-    halt_o            : out   std_logic_vector(255 downto 0)  -- what was written to HALT
+    data_o            : out   std_logic_vector(31 downto 0);  -- data that was read; valid one clock after read_i
+    liveness_i        : in    std_logic_vector(31 downto 0);  -- value that a read of LIVENESS returns
+    liveness_o        : out   std_logic_vector(31 downto 0);  -- value that was written to LIVENESS
+    programmed_i      : in    std_logic_vector(31 downto 0);  -- value that a read of PROGRAMMED returns
+    map_hash_i        : in    std_logic_vector(255 downto 0); -- value that a read of MAP_HASH returns
+    image_hash_i      : in    std_logic_vector(255 downto 0); -- value that a read of IMAGE_HASH returns
+    cap_machine_i     : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_MACHINE returns
+    cap_lines_i       : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_LINES returns
+    cap_total_lines_i : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_TOTAL_LINES returns
+    cap_line_offset_i : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_LINE_OFFSET returns
+    cap_partition_i   : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_PARTITION returns
+    cap_sensors_i     : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_SENSORS returns
+    cap_widths_i      : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_WIDTHS returns
+    cap_banks_i       : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_BANKS returns
+    cap_replicas_i    : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_REPLICAS returns
+    cap_interface_i   : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_INTERFACE returns
+    cap_speed_i       : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_SPEED returns
+    cap_steps_i       : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_STEPS returns
+    cap_link_i        : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_LINK returns
+    cap_sensor_bits_i : in    std_logic_vector(511 downto 0); -- value that a read of CAP_SENSOR_BITS returns
+    control_o         : out   std_logic_vector(31 downto 0);  -- value that was written to CONTROL
+    target_count_o    : out   std_logic_vector(31 downto 0);  -- value that was written to TARGET_COUNT
+    max_cycles_o      : out   std_logic_vector(63 downto 0);  -- value that was written to MAX_CYCLES
+    bank_o            : out   std_logic_vector(31 downto 0);  -- value that was written to BANK
+    prior_select_o    : out   std_logic_vector(31 downto 0);  -- value that was written to PRIOR_SELECT
+    run_until_o       : out   std_logic_vector(63 downto 0);  -- value that was written to RUN_UNTIL
+    start_o           : out   std_logic_vector(31 downto 0);  -- value that was written to START
+    resume_o          : out   std_logic_vector(31 downto 0);  -- value that was written to RESUME
+    done_i            : in    std_logic_vector(31 downto 0);  -- value that a read of DONE returns
+    status_i          : in    std_logic_vector(31 downto 0);  -- value that a read of STATUS returns
+    cycles_i          : in    std_logic_vector(63 downto 0);  -- value that a read of CYCLES returns
+    compute_ns_i      : in    std_logic_vector(63 downto 0);  -- value that a read of COMPUTE_NS returns
+    halt_o            : out   std_logic_vector(255 downto 0)  -- value that was written to HALT
   );
 end entity bm_register_block;
 
