@@ -9,7 +9,7 @@ library ieee;
 
 entity bm1_axi is
   generic (
-    ADDRESS_BITS : positive -- width of the address
+    ADDRESS_BITS : positive -- number of bits of an address
   );
   port (
     -- system
@@ -36,11 +36,11 @@ entity bm1_axi is
     -- access
     request_o : out   std_logic;                                   -- pulse: an access begins
     write_o   : out   std_logic;                                   -- 1: write, 0: read
-    address_o : out   std_logic_vector(ADDRESS_BITS - 1 downto 0); -- address in bytes
+    address_o : out   std_logic_vector(ADDRESS_BITS - 1 downto 0); -- byte address
     strobe_o  : out   std_logic_vector(3 downto 0);                -- byte enables of a write
     data_o    : out   std_logic_vector(31 downto 0);               -- data to write
     respond_i : in    std_logic;                                   -- pulse: the access is complete
-    refused_i : in    std_logic;                                   -- the access was refused
+    refused_i : in    std_logic;                                   -- with respond_i: 1 if the access was refused
     data_i    : in    std_logic_vector(31 downto 0)                -- read data
   );
 end entity bm1_axi;

@@ -1,6 +1,6 @@
 -- ================================================================================================
 -- rosbayes: bm1_table
--- Read-only memory whose contents come from a MIF; one clock from address to data.
+-- Read-only memory with the contents of a MIF. The data appear one clock after their address.
 -- MIT licence; datasheet: docs/hardware/bm1_table.md
 -- ================================================================================================
 
@@ -16,13 +16,13 @@ entity bm1_table is
     WORD_BITS    : positive; -- width of the MIF's words
     DEPTH        : positive; -- number of words
     ADDRESS_BITS : positive; -- width of the address
-    FIRST_BIT    : natural;  -- lowest of the bits read from a word
-    DATA_BITS    : positive  -- number of bits that are read
+    FIRST_BIT    : natural;  -- position of the lowest bit that is read from a word
+    DATA_BITS    : positive  -- number of bits that are read from a word
   );
   port (
     clk_i     : in    std_logic;                                   -- clock
-    enable_i  : in    std_logic;                                   -- read; otherwise the output is kept
+    enable_i  : in    std_logic;                                   -- 1: read, 0: keep the output
     address_i : in    std_logic_vector(ADDRESS_BITS - 1 downto 0); -- must be less than DEPTH
-    data_o    : out   std_logic_vector(DATA_BITS - 1 downto 0)     -- bits that are read, one clock later
+    data_o    : out   std_logic_vector(DATA_BITS - 1 downto 0)     -- bits that are read, one clock after their address
   );
 end entity bm1_table;

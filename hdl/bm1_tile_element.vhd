@@ -14,21 +14,21 @@ library work;
 entity bm1_tile_element is
   generic (
     PROB_BITS    : positive;      -- width of a probability code
-    MODE         : sensor_mode_t; -- input of the cell
+    MODE         : sensor_mode_t; -- kind of the cell's input
     ADDRESS_BITS : positive;      -- with SENSOR_CELL: address width of the table
     TABLE_FILE   : string;        -- with SENSOR_CELL: MIF of the column
-    LINES        : positive;      -- with SENSOR_CELL: lines in the MIF's words
-    LINE         : natural        -- with SENSOR_CELL: the cell's line
+    LINES        : positive;      -- with SENSOR_CELL: number of lines in a word of the MIF
+    LINE         : natural        -- with SENSOR_CELL: number of the cell's line
   );
   port (
     clk_i    : in    std_logic;                                -- clock
     load_i   : in    std_logic;                                -- a frame starts: latch the cell's input
     given_i  : in    std_logic_vector(SLOT_BITS - 1 downto 0); -- code from the column's table, or the cell's input
-    random_i : in    std_logic_vector(PROB_BITS - 1 downto 0); -- random number of the column or cell
+    random_i : in    std_logic_vector(PROB_BITS - 1 downto 0); -- random number of the column or of this cell
     bit_i    : in    std_logic;                                -- bitstream of the cells to the left
-    never_i  : in    std_logic;                                -- one of those cells has the code 0
+    never_i  : in    std_logic;                                -- a cell to the left has the code 0
     bit_o    : out   std_logic;                                -- bitstream of the product
-    never_o  : out   std_logic                                 -- this cell or one to the left has the code 0
+    never_o  : out   std_logic                                 -- this cell or a cell to the left has the code 0
   );
 end entity bm1_tile_element;
 
