@@ -15,7 +15,7 @@ library work;
 entity bm1 is
   generic (
     BOARD         : natural  := 0;                      -- index of this board in the constant PARTITIONS
-    MEMORY_FOLDER : string   := "bm_arch/Memory_MIFs/"; -- path of the MIFs, with a trailing slash
+    MEMORY_FOLDER : string   := "bm_arch/Memory_MIFs/"; -- folder of the MIFs, with a trailing slash
     CLOCK_HZ      : positive := 100_000_000             -- frequency of the clock
   );
   port (

@@ -20,17 +20,17 @@ entity bm1_core is
     ADDRESS_BITS  : natural_array_t;  -- address widths of the sensor columns (index 1 to SENSORS)
     PROB_BITS     : positive;         -- width of a probability code
     PRIOR_BITS    : natural;          -- width of the prior's address
-    WRITTEN       : boolean;          -- true: the host writes the prior; false: it is a table
+    WRITTEN       : boolean;          -- true: the host writes the prior; false: the prior is a table
     COUNTER_BITS  : positive;         -- width of a counter
     KIND          : rng_kind_t;       -- generators: LFSR or table
     STATE_BITS    : positive;         -- width of a generator's state
     TAPS          : std_logic_vector; -- feedback taps of an LFSR; STATE_BITS wide
-    RNG_SHARED    : boolean;          -- one generator per column; otherwise one per cell
+    RNG_SHARED    : boolean;          -- true: one generator per column; false: one per cell
     STEPS         : positive;         -- steps of a generator per clock
     BANKS         : positive;         -- number of seed sets
-    RESET_BANK    : boolean;          -- true: each frame restarts the generators
-    TABLE_LENGTH  : positive;         -- random numbers in the table, if one is used
-    MEMORY_FOLDER : string;           -- path of the MIFs, with a trailing slash
+    RESET_BANK    : boolean;          -- true: each frame restarts the generators; false: they continue
+    TABLE_LENGTH  : positive;         -- number of random numbers in the generators' table
+    MEMORY_FOLDER : string;           -- folder of the MIFs, with a trailing slash
     BOARD         : natural           -- index of this board
   );
   port (
@@ -40,7 +40,7 @@ entity bm1_core is
     -- commands, one clock long
     start_i  : in    std_logic; -- start a frame
     resume_i : in    std_logic; -- run the frame's next slice
-    reset_i  : in    std_logic; -- stop and clear
+    reset_i  : in    std_logic; -- stop the machine and clear counters and cycles
     -- settings
     target_i     : in    std_logic_vector(COUNTER_BITS - 1 downto 0);    -- target count
     max_cycles_i : in    std_logic_vector(63 downto 0);                  -- maximum cycles of a frame

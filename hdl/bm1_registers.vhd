@@ -22,13 +22,13 @@ entity bm1_registers is
     ADDRESS_BITS      : natural_array_t;                -- address widths of the sensor columns (index 1 to SENSORS)
     PROB_BITS         : positive;                       -- width of a probability code
     PRIOR_BITS        : natural;                        -- width of the prior's address
-    WRITTEN           : boolean;                        -- true: the host writes the prior; false: it is a table
+    WRITTEN           : boolean;                        -- true: the host writes the prior; false: the prior is a table
     COUNTER_BITS      : positive;                       -- width of a counter
     KIND              : rng_kind_t;                     -- generators: LFSR or table
-    RNG_SHARED        : boolean;                        -- one generator per column; otherwise one per cell
+    RNG_SHARED        : boolean;                        -- true: one generator per column; false: one per cell
     STEPS             : positive;                       -- steps of a generator per clock
     BANKS             : positive;                       -- number of seed sets
-    RESET_BANK        : boolean;                        -- true: each frame restarts the generators
+    RESET_BANK        : boolean;                        -- true: each frame restarts the generators; false: they continue
     INTERFACE_INPUTS  : positive;                       -- words of SENSORS or INPUTS
     INTERFACE_RESULTS : positive;                       -- words of RESULTS
     MODEL_LINES       : positive;                       -- lines of the whole model
@@ -36,7 +36,7 @@ entity bm1_registers is
     BOARD             : natural;                        -- index of this board
     BOARDS            : positive;                       -- number of boards
     IMAGE_HASH        : std_logic_vector(255 downto 0); -- identity of this board's image
-    MEMORY_FOLDER     : string;                         -- path of the MIFs, with a trailing slash
+    MEMORY_FOLDER     : string;                         -- folder of the MIFs, with a trailing slash
     CLOCK_HZ          : positive                        -- frequency of the clock
   );
   port (
@@ -56,7 +56,7 @@ entity bm1_registers is
     -- machine: commands and settings
     start_o       : out   std_logic;                                                   -- start a frame
     resume_o      : out   std_logic;                                                   -- run the frame's next slice
-    reset_o       : out   std_logic;                                                   -- stop and clear
+    reset_o       : out   std_logic;                                                   -- stop the machine and clear counters and cycles
     target_o      : out   std_logic_vector(COUNTER_BITS - 1 downto 0);                 -- target count
     max_cycles_o  : out   std_logic_vector(63 downto 0);                               -- maximum cycles of a frame
     run_until_o   : out   std_logic_vector(63 downto 0);                               -- end of the slice
