@@ -20,39 +20,39 @@ entity bm_register_block is
     read_i            : in    std_logic;                      -- read the word
     word_i            : in    std_logic_vector(7 downto 0);   -- index of the word: address / 4
     data_i            : in    std_logic_vector(31 downto 0);  -- data to write
-    data_o            : out   std_logic_vector(31 downto 0);  -- data that was read; valid one clock after read_i
-    liveness_i        : in    std_logic_vector(31 downto 0);  -- value that a read of LIVENESS returns
-    liveness_o        : out   std_logic_vector(31 downto 0);  -- value that was written to LIVENESS
-    programmed_i      : in    std_logic_vector(31 downto 0);  -- value that a read of PROGRAMMED returns
-    map_hash_i        : in    std_logic_vector(255 downto 0); -- value that a read of MAP_HASH returns
-    image_hash_i      : in    std_logic_vector(255 downto 0); -- value that a read of IMAGE_HASH returns
-    cap_machine_i     : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_MACHINE returns
-    cap_lines_i       : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_LINES returns
-    cap_total_lines_i : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_TOTAL_LINES returns
-    cap_line_offset_i : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_LINE_OFFSET returns
-    cap_partition_i   : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_PARTITION returns
-    cap_sensors_i     : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_SENSORS returns
-    cap_widths_i      : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_WIDTHS returns
-    cap_banks_i       : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_BANKS returns
-    cap_replicas_i    : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_REPLICAS returns
-    cap_interface_i   : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_INTERFACE returns
-    cap_speed_i       : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_SPEED returns
-    cap_steps_i       : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_STEPS returns
-    cap_link_i        : in    std_logic_vector(31 downto 0);  -- value that a read of CAP_LINK returns
-    cap_sensor_bits_i : in    std_logic_vector(511 downto 0); -- value that a read of CAP_SENSOR_BITS returns
-    control_o         : out   std_logic_vector(31 downto 0);  -- value that was written to CONTROL
-    target_count_o    : out   std_logic_vector(31 downto 0);  -- value that was written to TARGET_COUNT
-    max_cycles_o      : out   std_logic_vector(63 downto 0);  -- value that was written to MAX_CYCLES
-    bank_o            : out   std_logic_vector(31 downto 0);  -- value that was written to BANK
-    prior_select_o    : out   std_logic_vector(31 downto 0);  -- value that was written to PRIOR_SELECT
-    run_until_o       : out   std_logic_vector(63 downto 0);  -- value that was written to RUN_UNTIL
-    start_o           : out   std_logic_vector(31 downto 0);  -- value that was written to START
-    resume_o          : out   std_logic_vector(31 downto 0);  -- value that was written to RESUME
-    done_i            : in    std_logic_vector(31 downto 0);  -- value that a read of DONE returns
-    status_i          : in    std_logic_vector(31 downto 0);  -- value that a read of STATUS returns
-    cycles_i          : in    std_logic_vector(63 downto 0);  -- value that a read of CYCLES returns
-    compute_ns_i      : in    std_logic_vector(63 downto 0);  -- value that a read of COMPUTE_NS returns
-    halt_o            : out   std_logic_vector(255 downto 0)  -- value that was written to HALT
+    data_o            : out   std_logic_vector(31 downto 0);  -- data read; valid one clock after read_i
+    liveness_i        : in    std_logic_vector(31 downto 0);  -- value for reads of LIVENESS
+    liveness_o        : out   std_logic_vector(31 downto 0);  -- value written to LIVENESS
+    programmed_i      : in    std_logic_vector(31 downto 0);  -- value for reads of PROGRAMMED
+    map_hash_i        : in    std_logic_vector(255 downto 0); -- value for reads of MAP_HASH
+    image_hash_i      : in    std_logic_vector(255 downto 0); -- value for reads of IMAGE_HASH
+    cap_machine_i     : in    std_logic_vector(31 downto 0);  -- value for reads of CAP_MACHINE
+    cap_lines_i       : in    std_logic_vector(31 downto 0);  -- value for reads of CAP_LINES
+    cap_total_lines_i : in    std_logic_vector(31 downto 0);  -- value for reads of CAP_TOTAL_LINES
+    cap_line_offset_i : in    std_logic_vector(31 downto 0);  -- value for reads of CAP_LINE_OFFSET
+    cap_partition_i   : in    std_logic_vector(31 downto 0);  -- value for reads of CAP_PARTITION
+    cap_sensors_i     : in    std_logic_vector(31 downto 0);  -- value for reads of CAP_SENSORS
+    cap_widths_i      : in    std_logic_vector(31 downto 0);  -- value for reads of CAP_WIDTHS
+    cap_banks_i       : in    std_logic_vector(31 downto 0);  -- value for reads of CAP_BANKS
+    cap_replicas_i    : in    std_logic_vector(31 downto 0);  -- value for reads of CAP_REPLICAS
+    cap_interface_i   : in    std_logic_vector(31 downto 0);  -- value for reads of CAP_INTERFACE
+    cap_speed_i       : in    std_logic_vector(31 downto 0);  -- value for reads of CAP_SPEED
+    cap_steps_i       : in    std_logic_vector(31 downto 0);  -- value for reads of CAP_STEPS
+    cap_link_i        : in    std_logic_vector(31 downto 0);  -- value for reads of CAP_LINK
+    cap_sensor_bits_i : in    std_logic_vector(511 downto 0); -- value for reads of CAP_SENSOR_BITS
+    control_o         : out   std_logic_vector(31 downto 0);  -- value written to CONTROL
+    target_count_o    : out   std_logic_vector(31 downto 0);  -- value written to TARGET_COUNT
+    max_cycles_o      : out   std_logic_vector(63 downto 0);  -- value written to MAX_CYCLES
+    bank_o            : out   std_logic_vector(31 downto 0);  -- value written to BANK
+    prior_select_o    : out   std_logic_vector(31 downto 0);  -- value written to PRIOR_SELECT
+    run_until_o       : out   std_logic_vector(63 downto 0);  -- value written to RUN_UNTIL
+    start_o           : out   std_logic_vector(31 downto 0);  -- value written to START
+    resume_o          : out   std_logic_vector(31 downto 0);  -- value written to RESUME
+    done_i            : in    std_logic_vector(31 downto 0);  -- value for reads of DONE
+    status_i          : in    std_logic_vector(31 downto 0);  -- value for reads of STATUS
+    cycles_i          : in    std_logic_vector(63 downto 0);  -- value for reads of CYCLES
+    compute_ns_i      : in    std_logic_vector(63 downto 0);  -- value for reads of COMPUTE_NS
+    halt_o            : out   std_logic_vector(255 downto 0)  -- value written to HALT
   );
 end entity bm_register_block;
 
