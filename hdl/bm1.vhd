@@ -1,6 +1,6 @@
 -- ================================================================================================
 -- rosbayes: bm1
--- A board: the Bayesian machine of bm1_parameters.vhd behind its registers and an AXI4-Lite slave.
+-- A board: a BM1 with its registers and an AXI4-Lite slave, configured by bm1_parameters.vhd.
 -- MIT licence; datasheet: docs/hardware/bm1.md
 -- ================================================================================================
 
