@@ -48,7 +48,7 @@ entity bm1_control is
     has_run_o         : out   std_logic;                                   -- the machine has run since the last reset
     cycles_o          : out   std_logic_vector(63 downto 0);               -- cycles of the frame
     reason_o          : out   std_logic_vector(2 downto 0);                -- stop reason
-    ready_o           : out   std_logic_vector(REPLICAS - 1 downto 0);     -- replicas that can be resumed
+    ready_o           : out   std_logic_vector(REPLICAS - 1 downto 0);     -- bit r: replica r can be resumed
     replica_reasons_o : out   std_logic_vector(3 * REPLICAS - 1 downto 0); -- stop reason of each replica
     replica_cycles_o  : out   std_logic_vector(64 * REPLICAS - 1 downto 0) -- cycles of each replica
   );

@@ -45,7 +45,7 @@ entity bm1_core is
     target_i     : in    std_logic_vector(COUNTER_BITS - 1 downto 0);    -- target count
     max_cycles_i : in    std_logic_vector(63 downto 0);                  -- maximum cycles of a frame
     run_until_i  : in    std_logic_vector(63 downto 0);                  -- end of the slice
-    bank_i       : in    std_logic_vector(bits_for(BANKS) - 1 downto 0); -- set of seeds
+    bank_i       : in    std_logic_vector(bits_for(BANKS) - 1 downto 0); -- number of the seed set
     halt_i       : in    std_logic_vector(REPLICAS - 1 downto 0);        -- replicas to halt
     -- inputs of the frame, replica 0 lowest
     priors_i      : in    std_logic_vector(REPLICAS * SLOT_BITS - 1 downto 0);         -- each replica's address in the prior's table
@@ -58,7 +58,7 @@ entity bm1_core is
     has_run_o         : out   std_logic;                                                     -- the machine has run since the last reset
     cycles_o          : out   std_logic_vector(63 downto 0);                                 -- cycles of the frame
     reason_o          : out   std_logic_vector(2 downto 0);                                  -- stop reason
-    ready_o           : out   std_logic_vector(REPLICAS - 1 downto 0);                       -- replicas that can be resumed
+    ready_o           : out   std_logic_vector(REPLICAS - 1 downto 0);                       -- bit r: replica r can be resumed
     replica_reasons_o : out   std_logic_vector(3 * REPLICAS - 1 downto 0);                   -- stop reason of each replica
     replica_cycles_o  : out   std_logic_vector(64 * REPLICAS - 1 downto 0);                  -- cycles of each replica
     counts_o          : out   std_logic_vector(REPLICAS * LINES * COUNTER_BITS - 1 downto 0) -- counters

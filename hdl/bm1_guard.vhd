@@ -1,6 +1,6 @@
 -- ================================================================================================
 -- rosbayes: bm1_guard
--- Checks each access by address, state of the board and value, and gives the reason of a refusal.
+-- Accepts or refuses each access by its address, its value and the state of the board.
 -- MIT licence; datasheet: docs/hardware/bm1_guard.md
 -- ================================================================================================
 
@@ -15,7 +15,7 @@ entity bm1_guard is
   generic (
     REPLICAS            : positive; -- number of replicas: machines that share the generators
     COUNTER_BITS        : positive; -- width of a counter
-    PRIOR_BITS          : natural;  -- width of the prior's address
+    PRIOR_BITS          : natural;  -- width of the prior select
     BANKS               : positive; -- number of seed sets
     SENSORS_DEPTH       : natural;  -- number of implemented words of SENSORS
     INPUTS_DEPTH        : natural;  -- number of implemented words of INPUTS
@@ -33,16 +33,16 @@ entity bm1_guard is
     -- state
     running_i    : in    std_logic;                               -- the machine runs
     can_resume_i : in    std_logic;                               -- the machine is at the end of a slice
-    ready_i      : in    std_logic_vector(REPLICAS - 1 downto 0); -- replicas that can be resumed
-    done_i       : in    std_logic_vector(31 downto 0);           -- register DONE: number of the last ended start or resume
-    cycles_i     : in    std_logic_vector(63 downto 0);           -- cycles of the frame
+    ready_i      : in    std_logic_vector(REPLICAS - 1 downto 0); -- bit r: replica r can be resumed
+    done_i       : in    std_logic_vector(31 downto 0);           -- register DONE: doorbell number of the last start or resume that ended
+    cycles_i     : in    std_logic_vector(63 downto 0);           -- number of cycles of the frame so far
     -- settings
     target_i     : in    std_logic_vector(31 downto 0);  -- target count
     max_cycles_i : in    std_logic_vector(63 downto 0);  -- maximum cycles
-    run_until_i  : in    std_logic_vector(63 downto 0);  -- end of the slice
-    bank_i       : in    std_logic_vector(31 downto 0);  -- set of seeds
-    prior_i      : in    std_logic_vector(31 downto 0);  -- prior select of a single machine
-    halt_i       : in    std_logic_vector(255 downto 0); -- replicas to halt
+    run_until_i  : in    std_logic_vector(63 downto 0);  -- cycle at which the slice ends; 0: no end
+    bank_i       : in    std_logic_vector(31 downto 0);  -- number of the seed set
+    prior_i      : in    std_logic_vector(31 downto 0);  -- prior select of a board without replicas
+    halt_i       : in    std_logic_vector(255 downto 0); -- bit r of HALT: a resume stops replica r
     bad_input_i  : in    std_logic;                      -- an input word is too large
     -- verdict
     error_o : out   std_logic_vector(7 downto 0); -- reason of a refusal; 0: none

@@ -10,15 +10,15 @@ library ieee;
 entity bm1_lfsr is
   generic (
     STATE_BITS : positive;         -- width of the register
-    TAPS       : std_logic_vector; -- mask of the bits whose parity is shifted in; STATE_BITS wide
+    TAPS       : std_logic_vector; -- mask, STATE_BITS wide: a step shifts in the parity of the masked bits
     STEPS      : positive          -- steps per clock
   );
   port (
     clk_i   : in    std_logic;                                 -- clock
-    shift_i : in    std_logic;                                 -- shift the seed in
+    shift_i : in    std_logic;                                 -- 1: load seed_i into the state
     seed_i  : in    std_logic_vector(STATE_BITS - 1 downto 0); -- seed from the memory or the previous generator
-    step_i  : in    std_logic;                                 -- make the steps of a cycle
-    state_o : out   std_logic_vector(STATE_BITS - 1 downto 0)  -- state, whose low bits are the random number
+    step_i  : in    std_logic;                                 -- make STEPS steps
+    state_o : out   std_logic_vector(STATE_BITS - 1 downto 0)  -- state; the low bits of the state are the random number
   );
 end entity bm1_lfsr;
 

@@ -60,7 +60,7 @@ entity bm1_registers is
     target_o      : out   std_logic_vector(COUNTER_BITS - 1 downto 0);                 -- target count
     max_cycles_o  : out   std_logic_vector(63 downto 0);                               -- maximum cycles of a frame
     run_until_o   : out   std_logic_vector(63 downto 0);                               -- end of the slice
-    bank_o        : out   std_logic_vector(bits_for(BANKS) - 1 downto 0);              -- set of seeds
+    bank_o        : out   std_logic_vector(bits_for(BANKS) - 1 downto 0);              -- number of the seed set
     halt_o        : out   std_logic_vector(REPLICAS - 1 downto 0);                     -- replicas to halt
     priors_o      : out   std_logic_vector(REPLICAS * SLOT_BITS - 1 downto 0);         -- each replica's address in the prior's table
     prior_codes_o : out   std_logic_vector(REPLICAS * LINES * SLOT_BITS - 1 downto 0); -- written prior
@@ -72,7 +72,7 @@ entity bm1_registers is
     has_run_i         : in    std_logic;                                                     -- the machine has run since the last reset
     cycles_i          : in    std_logic_vector(63 downto 0);                                 -- cycles of the frame
     reason_i          : in    std_logic_vector(2 downto 0);                                  -- stop reason
-    ready_i           : in    std_logic_vector(REPLICAS - 1 downto 0);                       -- replicas that can be resumed
+    ready_i           : in    std_logic_vector(REPLICAS - 1 downto 0);                       -- bit r: replica r can be resumed
     replica_reasons_i : in    std_logic_vector(3 * REPLICAS - 1 downto 0);                   -- stop reason of each replica
     replica_cycles_i  : in    std_logic_vector(64 * REPLICAS - 1 downto 0);                  -- cycles of each replica
     counts_i          : in    std_logic_vector(REPLICAS * LINES * COUNTER_BITS - 1 downto 0) -- counters
