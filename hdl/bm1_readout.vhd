@@ -16,12 +16,12 @@ entity bm1_readout is
   );
   port (
     clk_i     : in    std_logic;                                             -- clock
-    index_i   : in    std_logic_vector(11 downto 0);                         -- index of a counter or of a word of OUTCOMES (10 bits)
+    index_i   : in    std_logic_vector(11 downto 0);                         -- index of a counter, or of a word of OUTCOMES (10 bits)
     counts_i  : in    std_logic_vector(RESULTS * COUNTER_BITS - 1 downto 0); -- counters; counter 0 in the lowest bits
     reasons_i : in    std_logic_vector(3 * REPLICAS - 1 downto 0);           -- stop reasons of the replicas
     cycles_i  : in    std_logic_vector(64 * REPLICAS - 1 downto 0);          -- numbers of cycles of the replicas
-    result_o  : out   std_logic_vector(31 downto 0);                         -- counter at index_i, one clock later
-    outcome_o : out   std_logic_vector(31 downto 0)                          -- word of OUTCOMES at index_i, one clock later
+    result_o  : out   std_logic_vector(31 downto 0);                         -- counter that index_i selected one clock earlier
+    outcome_o : out   std_logic_vector(31 downto 0)                          -- word of OUTCOMES that index_i selected one clock earlier
   );
 end entity bm1_readout;
 

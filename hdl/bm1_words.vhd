@@ -29,7 +29,7 @@ entity bm1_words is
     write_i  : in    std_logic;                                       -- write data_i to word index_i
     index_i  : in    std_logic_vector(bits_for(DEPTH) - 1 downto 0);  -- index of the word to write or read
     data_i   : in    std_logic_vector(31 downto 0);                   -- data to write
-    data_o   : out   std_logic_vector(31 downto 0);                   -- word index_i, one clock later
+    data_o   : out   std_logic_vector(31 downto 0);                   -- word that index_i selected one clock earlier
     values_o : out   std_logic_vector(USED * SLOT_BITS - 1 downto 0); -- used words; word 0 in the lowest bits
     bad_o    : out   std_logic                                        -- a used word has a 1 beyond its used bits
   );
