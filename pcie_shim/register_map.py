@@ -14,9 +14,9 @@ BAR_SIZE: Final = 0x20000
 class BoardState(IntEnum):
     """Values of STATUS.STATE."""
 
-    BLANK = 0  # no image: only identity and control registers are usable
-    IDLE = 1  # reset; nothing has run
-    RUNNING = 2  # the machine is running; writes are refused, except CONTROL.RESET
+    BLANK = 0  # no image is loaded. Only identity and control registers are usable
+    IDLE = 1  # nothing has run since the reset
+    RUNNING = 2  # the machine is running. The board refuses all writes except CONTROL.RESET
     DONE = 3  # the machine has stopped for the reason in STOP_REASON
 
 
@@ -34,7 +34,7 @@ class ErrorCode(IntEnum):
     BAD_VALUE = 8  # the machine does not accept a value: an address, the target, the bank or a number of cycles
     STALE = 9  # the board was programmed after this handle was opened
     HELD = 10  # another host holds the board, or another loader is programming it
-    BAD_FRAME = 11  # the frame is invalid: operation, length, CRC or sequence number; the link is closed
+    BAD_FRAME = 11  # a link frame has an invalid operation, length, CRC or sequence number. The board closes the link
     BAD_IMAGE = 12  # the image is damaged, or was built for another map or board
 
 
