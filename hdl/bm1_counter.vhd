@@ -15,11 +15,11 @@ entity bm1_counter is
   port (
     clk_i    : in    std_logic;                                   -- clock
     clear_i  : in    std_logic;                                   -- clear the counter
-    enable_i : in    std_logic;                                   -- a cycle is run
+    enable_i : in    std_logic;                                   -- the machine runs a cycle
     bit_i    : in    std_logic;                                   -- bitstream of the line
     target_i : in    std_logic_vector(COUNTER_BITS - 1 downto 0); -- count at which the machine stops
     count_o  : out   std_logic_vector(COUNTER_BITS - 1 downto 0); -- number of ones
-    full_o   : out   std_logic                                    -- the target is reached
+    full_o   : out   std_logic                                    -- the count is equal to the target
   );
 end entity bm1_counter;
 

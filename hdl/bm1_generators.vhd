@@ -16,24 +16,24 @@ entity bm1_generators is
   generic (
     GENERATORS   : positive;         -- number of generators: one per column or per cell
     KIND         : rng_kind_t;       -- LFSR or table
-    STATE_BITS   : positive;         -- width of a state
+    STATE_BITS   : positive;         -- width of a generator's state
     TAPS         : std_logic_vector; -- feedback taps of an LFSR; STATE_BITS wide
-    STEPS        : positive;         -- steps per clock
+    STEPS        : positive;         -- steps of a generator per clock
     BANKS        : positive;         -- number of seed sets
     PROB_BITS    : positive;         -- width of a random number
-    SEED_FILE    : string;           -- MIF of the seeds: bank by bank, generator by generator
+    SEED_FILE    : string;           -- MIF of the seeds, ordered by bank, and within a bank by generator
     TABLE_FILE   : string;           -- MIF of the random numbers, if a table is used
-    TABLE_LENGTH : positive          -- number of random numbers
+    TABLE_LENGTH : positive          -- number of random numbers in the table
   );
   port (
     clk_i     : in    std_logic;                                             -- clock
-    rst_i     : in    std_logic;                                             -- load bank 0
-    restart_i : in    std_logic;                                             -- load the bank
+    rst_i     : in    std_logic;                                             -- load the seeds of bank 0
+    restart_i : in    std_logic;                                             -- load the seeds of bank bank_i
     bank_i    : in    std_logic_vector(bits_for(BANKS) - 1 downto 0);        -- index of the bank
-    step_i    : in    std_logic;                                             -- a cycle is run
-    ready_o   : out   std_logic;                                             -- all seeds are loaded
-    randoms_o : out   std_logic_vector(GENERATORS * PROB_BITS - 1 downto 0); -- random numbers, generator 0 lowest
-    states_o  : out   std_logic_vector(GENERATORS * STATE_BITS - 1 downto 0) -- states, generator 0 lowest
+    step_i    : in    std_logic;                                             -- the machine runs a cycle
+    ready_o   : out   std_logic;                                             -- all generators have their seeds
+    randoms_o : out   std_logic_vector(GENERATORS * PROB_BITS - 1 downto 0); -- random numbers; generator 0 in the lowest bits
+    states_o  : out   std_logic_vector(GENERATORS * STATE_BITS - 1 downto 0) -- states; generator 0 in the lowest bits
   );
 end entity bm1_generators;
 

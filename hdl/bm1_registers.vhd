@@ -27,17 +27,17 @@ entity bm1_registers is
     KIND              : rng_kind_t;                     -- generators: LFSR or table
     RNG_SHARED        : boolean;                        -- true: one generator per column; false: one per cell
     STEPS             : positive;                       -- steps of a generator per clock
-    BANKS             : positive;                       -- number of seed sets
+    BANKS             : positive;                       -- number of seed sets (banks)
     RESET_BANK        : boolean;                        -- true: each frame restarts the generators; false: they continue
-    INTERFACE_INPUTS  : positive;                       -- words of SENSORS or INPUTS
-    INTERFACE_RESULTS : positive;                       -- words of RESULTS
-    MODEL_LINES       : positive;                       -- lines of the whole model
-    LINE_OFFSET       : natural;                        -- first line of this board
+    INTERFACE_INPUTS  : positive;                       -- number of words of the block SENSORS or INPUTS
+    INTERFACE_RESULTS : positive;                       -- number of words of the block RESULTS
+    MODEL_LINES       : positive;                       -- number of lines of the whole model
+    LINE_OFFSET       : natural;                        -- index of the first line of this board
     BOARD             : natural;                        -- index of this board
     BOARDS            : positive;                       -- number of boards
     IMAGE_HASH        : std_logic_vector(255 downto 0); -- identity of this board's image
     MEMORY_FOLDER     : string;                         -- folder of the MIFs, with a trailing slash
-    CLOCK_HZ          : positive                        -- frequency of the clock
+    CLOCK_HZ          : positive                        -- frequency of the clock in hertz
   );
   port (
     -- system
@@ -52,18 +52,18 @@ entity bm1_registers is
     data_i    : in    std_logic_vector(31 downto 0);                   -- data to write
     respond_o : out   std_logic;                                       -- pulse: the access is complete
     refused_o : out   std_logic;                                       -- the access was refused
-    data_o    : out   std_logic_vector(31 downto 0);                   -- read data
+    data_o    : out   std_logic_vector(31 downto 0);                   -- data that was read
     -- machine: commands and settings
-    start_o       : out   std_logic;                                                   -- start a frame
-    resume_o      : out   std_logic;                                                   -- run the frame's next slice
+    start_o       : out   std_logic;                                                   -- pulse: start a frame
+    resume_o      : out   std_logic;                                                   -- pulse: run the frame's next slice
     reset_o       : out   std_logic;                                                   -- stop the machine and clear counters and cycles
     target_o      : out   std_logic_vector(COUNTER_BITS - 1 downto 0);                 -- target count
-    max_cycles_o  : out   std_logic_vector(63 downto 0);                               -- maximum cycles of a frame
-    run_until_o   : out   std_logic_vector(63 downto 0);                               -- end of the slice
-    bank_o        : out   std_logic_vector(bits_for(BANKS) - 1 downto 0);              -- number of the seed set
+    max_cycles_o  : out   std_logic_vector(63 downto 0);                               -- maximum number of cycles of a frame
+    run_until_o   : out   std_logic_vector(63 downto 0);                               -- cycle at which the slice ends
+    bank_o        : out   std_logic_vector(bits_for(BANKS) - 1 downto 0);              -- index of the seed set
     halt_o        : out   std_logic_vector(REPLICAS - 1 downto 0);                     -- replicas to halt
     priors_o      : out   std_logic_vector(REPLICAS * SLOT_BITS - 1 downto 0);         -- each replica's address in the prior's table
-    prior_codes_o : out   std_logic_vector(REPLICAS * LINES * SLOT_BITS - 1 downto 0); -- written prior
+    prior_codes_o : out   std_logic_vector(REPLICAS * LINES * SLOT_BITS - 1 downto 0); -- codes of the written prior
     inputs_o      : out   std_logic_vector(
       REPLICAS * SENSORS * inputs_per_column(MODE, LINES) * SLOT_BITS - 1 downto 0);   -- readings
     -- machine: outcome
@@ -75,7 +75,7 @@ entity bm1_registers is
     ready_i           : in    std_logic_vector(REPLICAS - 1 downto 0);                       -- bit r: replica r can be resumed
     replica_reasons_i : in    std_logic_vector(3 * REPLICAS - 1 downto 0);                   -- stop reason of each replica
     replica_cycles_i  : in    std_logic_vector(64 * REPLICAS - 1 downto 0);                  -- cycles of each replica
-    counts_i          : in    std_logic_vector(REPLICAS * LINES * COUNTER_BITS - 1 downto 0) -- counters
+    counts_i          : in    std_logic_vector(REPLICAS * LINES * COUNTER_BITS - 1 downto 0) -- counts of all lines
   );
 end entity bm1_registers;
 
