@@ -61,7 +61,7 @@ entity bm1_registers is
     max_cycles_o  : out   std_logic_vector(63 downto 0);                               -- maximum number of cycles of a frame
     run_until_o   : out   std_logic_vector(63 downto 0);                               -- cycle at which the slice ends
     bank_o        : out   std_logic_vector(bits_for(BANKS) - 1 downto 0);              -- index of the seed set
-    halt_o        : out   std_logic_vector(REPLICAS - 1 downto 0);                     -- replicas to halt
+    halt_o        : out   std_logic_vector(REPLICAS - 1 downto 0);                     -- bit r: halt replica r
     priors_o      : out   std_logic_vector(REPLICAS * SLOT_BITS - 1 downto 0);         -- each replica's address in the prior's table
     prior_codes_o : out   std_logic_vector(REPLICAS * LINES * SLOT_BITS - 1 downto 0); -- codes of the written prior
     inputs_o      : out   std_logic_vector(
