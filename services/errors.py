@@ -47,7 +47,7 @@ class VariableError(StackError):
 
 
 class BoardFailedError(StackError):
-    """A board failed, or failed too often."""
+    """A board failed for good, or frames failed on boards too often for the run to go on."""
 
     exit_code = ExitCode.BOARD
 

@@ -180,8 +180,8 @@ class MiniCluster:
     def run(self, frame: FrameInput) -> FrameOutput:
         """Compute one frame on all boards.
 
-        After an error, the frame is lost. If a board only refused an access, all boards are usable at once. Otherwise,
-        the failed board must be reopened with `reopen`, and only the other boards are usable at once.
+        After an error, the frame is lost. If a board only refused an access, all boards stay usable. Otherwise, the
+        failed board must be reopened with `reopen`, and only the other boards stay usable.
 
         Raises:
             FrameInputError: The frame does not fit the machine. No board was accessed.

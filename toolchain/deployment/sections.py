@@ -220,8 +220,8 @@ class Variable(Section):
     """`[[variable]]`: a known variable, and the conversion of its readings to addresses.
 
     A variable of kind `sensor` is a column of the machine. A variable of kind `prior_select` selects the row
-    of the prior's table (thesis 2.1.2). A missing reading selects the table's top row, the prior without a
-    selection.
+    of the prior's table (thesis 2.1.2). A missing reading selects the table's last row (the top
+    address), the prior without a selection.
     """
 
     name: Name

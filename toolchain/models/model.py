@@ -140,7 +140,7 @@ class Known(TabulatedVariable):
 class PriorSelect(TabulatedVariable):
     """A known variable A that selects the prior (thesis 2.1.2). Its table is P(S | A), and each row sums to 1.
 
-    In the machine, the top row of the prior's table is the prior that applies while A is missing.
+    In the machine, the last row of the prior's table is the prior that applies while A is missing.
     """
 
     def __post_init__(self) -> None:
