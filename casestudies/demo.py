@@ -37,7 +37,7 @@ app = CommandLine()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """A case study as the demo runs it. Each command gets its options from this object, and the option `--uri`."""
+    """A case study as the demo runs it. Each command gets the options in this object. It also gets `--uri`."""
 
     name: str
     topic: str

@@ -69,7 +69,7 @@ _Ran = tuple[Integers, list[int], npt.NDArray[Any]]
 
 
 class Chains:
-    """The chains of one model. All parameters of their machines are equal, except `chain` and perhaps `chains`.
+    """The chains of one model. The parameters of their machines may differ only in `chain` and `chains`.
 
     Raises:
         ParameterError: The machines differ in something else.

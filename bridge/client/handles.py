@@ -156,7 +156,7 @@ class Subscription(Handle):
         self.discarded += 1
 
     def leave_out(self, reason: str) -> None:
-        """Record why the client no longer subscribes to the topic, which the reader gets as an error after its queue."""
+        """Record why the client no longer subscribes to the topic. After queued messages, the reader gets the error."""
         _log.warning("%s %s", self.topic, reason)
         self._left_out = reason
         self._wake()

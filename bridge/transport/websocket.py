@@ -225,7 +225,7 @@ class WebSocketTransport(asyncio.Protocol):
         self._transport.set_write_buffer_limits(high=self._write_limit)
 
     def data_received(self, data: bytes) -> None:
-        """Handle bytes from the socket. The library handles all frames except whole messages."""
+        """Handle bytes from the socket: messages of one frame here, and all other frames by the websockets library."""
         self.last_heard = time.monotonic()
         at = 0
         if self._rest:

@@ -96,7 +96,7 @@ class Simulation:
         self._errors.close()
 
     def power_up(self) -> None:
-        """Reset the hardware with its pin."""
+        """Reset the simulated hardware through its reset pin, as at power-up."""
         self._execute("z", 0, 0, 2, START_S)
 
     def run(self, clocks: int) -> SimulatorAnswer:

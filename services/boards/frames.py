@@ -28,7 +28,7 @@ class BoardAwayError(BoardError):
 def driver_input(deployment: Deployment, frame: FrameRequest, stop: str) -> FrameInput:
     """Return the driver's input for a frame, or raise a FrameInputError.
 
-    `stop` is the value of the setting of the same name: `slices` or `own`.
+    `stop` says how boards stop: together at the end of a slice (`slices`), or each at its own overflow (`own`).
     """
     machine = deployment.machine
     prior = np.frombuffer(frame.prior_codes, "<u2") if frame.prior_codes else None
@@ -59,7 +59,7 @@ def driver_input(deployment: Deployment, frame: FrameRequest, stop: str) -> Fram
 
 
 def machine_inputs(deployment: Deployment, addresses: Addresses) -> tuple[npt.NDArray[np.int64], PriorRow]:
-    """Return a frame's inputs and its row of the prior, for a machine that reads arrays. A missing input is -1."""
+    """Return a frame's inputs and its row of the prior, for a machine with the block INPUTS. A missing input is -1."""
     variables = deployment.variables
     if len(addresses) != len(variables):
         raise FrameInputError(

@@ -36,7 +36,7 @@ SLOW_FRAMES: Final = 20
 """Default number of frames for a slow machine: a machine with one generator per cell, or without LFSRs."""
 LEAST_FRAMES: Final = 20
 SLOW_LEAST_FRAMES: Final = 3
-"""Minimum default number of frames for a slow machine. With replicas, `SLOW_FRAMES` is divided by their number."""
+"""With replicas, the default number of frames is `SLOW_FRAMES` divided by their number, but at least this many."""
 SLOW_BANKS: Final = 1
 
 

@@ -95,7 +95,7 @@ class Of(StrEnum):
     WORD = "word"
     """A word that the host writes for a frame, in bm1_words. Its logic decodes the address and checks the value."""
     MEMORY = "memory"
-    """A memory of the words that the host writes, in bm1_words. Its logic writes initial words after a reset, and reads."""
+    """A memory of the words that the host writes, in bm1_words. Its logic writes the words of a reset, and reads."""
     REPLICA = "replica"
     """A replica, if there are several. Its logic, in bm1_control and bm1_readout, handles stop, resume and outcome."""
 

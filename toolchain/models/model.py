@@ -123,7 +123,7 @@ class Known(TabulatedVariable):
     """A known variable K, which has a column in the machine. Its table P(K | S) sums to 1 on each line."""
 
     floor: float = 0.0
-    """Minimum probability of an outlier in the table, as a fraction of the likelihood's peak, or 0 without a minimum.
+    """Lower bound of the table's probabilities, as a fraction of the likelihood's peak; 0 means no bound.
 
     Quantising warns if the codes cannot express the minimum.
     """
