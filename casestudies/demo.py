@@ -53,7 +53,7 @@ class Case:
     publishers: Mapping[str, Sequence[str]]
     """Options of each command on the robot's side, in the order in which the commands are started."""
     counts_frames: bool = True
-    """Whether the viewer shows every frame of the master. If so, the demo also gives `--count` to the master."""
+    """True if the viewer shows every frame of the master. The demo then passes `--count` to the master as well."""
 
 
 def boat(rates: Sequence[str], clock: float, *, array: bool) -> Case:

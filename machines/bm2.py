@@ -74,8 +74,8 @@ class BM2Parameters:
     """Parameters of a BM2: bit-level Gibbs sampling in a product of factors.
 
     Each factor has a conditional distribution encoder (CDE). In a move, the sequencer points at one or more bits of
-    the state, and the machine draws these bits anew. A sweep points once at each unknown bit. With the sequencer
-    `random`, a sweep is as many moves as there are unknown bits.
+    the state, and the machine draws new values for these bits. A sweep points once at each unknown bit. If the
+    sequencer is `random`, a sweep is as many moves as there are unknown bits.
 
     Attributes:
         cardinalities: Number of values of each variable, in the model's order.

@@ -48,7 +48,7 @@ _LFSR_BITS: Final = {RngKind.LFSR8: 8, RngKind.LFSR16: 16, RngKind.LFSR24: 24, R
 
 
 class RngReset(StrEnum):
-    """Where the generators begin a frame: at the seeds of a bank (`bank`), or where the last frame ended (`free`)."""
+    """Start of the generators in a frame: the seeds of a bank (`bank`), or the end of the last frame (`free`)."""
 
     BANK = "bank"
     FREE = "free"
@@ -78,7 +78,7 @@ class Sequencer(StrEnum):
 
 
 class SampleEvery(StrEnum):
-    """Whether a BM2 takes a sample after each sweep or after each move."""
+    """The step after which a BM2 takes a sample: a sweep, or a single move."""
 
     SWEEP = "sweep"
     MOVE = "move"

@@ -47,7 +47,7 @@ class Client:
     refused: int = 0
     """Number of the client's operations that were refused."""
     takeovers: int = 0
-    """How often the client took over a service or an action that another client offered."""
+    """Number of services and actions that the client took over from other clients."""
     fragments: Reassembler | None = None
     """The `Reassembler` of the client's fragments, or None until the client sends a fragment."""
     wants_status: bool = False

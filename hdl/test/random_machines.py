@@ -132,7 +132,7 @@ def codes(
 
 
 def _numbers(random: np.random.Generator, parameters: BM1Parameters) -> NDArray[np.uint32] | None:
-    """Return a table of random numbers, often of a length that is no power of two; None if the machine has no table."""
+    """Return a table of random numbers, or None if the machine has no table. Few lengths are powers of two."""
     if parameters.rng is not RngKind.TABLE:
         return None
     length = int(random.choice([1, 2, 17, 64, 199, 500]))

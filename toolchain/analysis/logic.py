@@ -75,7 +75,7 @@ class Of(StrEnum):
     """The units in which a machine's logic is counted. The text of each unit names the VHDL that contains it."""
 
     BOARD = "board"
-    """What each board has once: bm1_axi, bm_register_block, bm1_guard, and bm1_control for one machine."""
+    """The units of which a board has one: bm1_axi, bm_register_block, bm1_guard, and bm1_control for one machine."""
     CODE_BIT = "code bit"
     """A bit of a cell's code, in bm1_stochastic_bitstream_generator.
 

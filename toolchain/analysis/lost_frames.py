@@ -57,8 +57,8 @@ def lost_frames(plan: MachinePlan, quantised: Quantised) -> LostFrames:
     share = _share(chances, plan.options, plan.max_cycles)
     what = (
         f"{share:.1%} of {frames} frames drawn from the model get no posterior, as computed from the codes: in "
-        f"{(chances == 0).mean():.1%} of all frames every line has a code 0, and in the rest of the {share:.1%} no line "
-        f"counts in {plan.max_cycles} cycles"
+        f"{(chances == 0).mean():.1%} of all frames every line has a code 0, and in the rest of the {share:.1%} "
+        f"no line counts in {plan.max_cycles} cycles"
     )
     return LostFrames(share, what, _advice(plan, drawn) if share > TOLERATED else "")
 

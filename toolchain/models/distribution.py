@@ -172,7 +172,7 @@ class Symbol:
     bits: int = 0
     """Number of address bits of the symbol's column in the machine. 0 means the fewest bits that suffice."""
     on_range: Literal["error", "clamp", "missing"] = "error"
-    """What a reading out of range counts as: an error, the nearest value in range (`clamp`), or a missing reading."""
+    """Treatment of a reading out of range: as an error, as the nearest value in range (`clamp`), or as missing."""
     on_missing: Literal["error", "missing"] = "error"
     """`missing` if a reading may be missing."""
 

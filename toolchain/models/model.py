@@ -77,7 +77,7 @@ class TabulatedVariable:
     period: int | None = None
     """Number of addresses in one turn of a cyclic reading, such as a bearing, or None for other readings."""
     on_range: Literal["error", "clamp", "missing"] = "error"
-    """What a reading out of range becomes: an error, the nearest end, or a missing reading."""
+    """Treatment of a reading out of range: as an error, as the nearest value in range (`clamp`), or as missing."""
     on_missing: Literal["error", "missing"] = "error"
     """`missing` if a reading may be missing."""
     path: str = ""

@@ -85,7 +85,7 @@ foreach revision {{{" ".join(revisions)}}} {{
 
 
 class Change(StrEnum):
-    """How writing `OutputFiles` changes a file."""
+    """The effect on a file when `OutputFiles` are written."""
 
     UNCHANGED = "unchanged"
     CHANGED = "changed"
