@@ -1,6 +1,6 @@
 -- ================================================================================================
 -- rosbayes: bm1_registers
--- Register map of a board: checks, executes and answers each access, and starts the machine.
+-- The register map of a board. It checks, executes and answers each access, and starts the machine.
 -- MIT licence; datasheet: docs/hardware/bm1_registers.md
 -- ================================================================================================
 

@@ -36,7 +36,7 @@ _SENSOR_BITS_MAX: Final = 64  # columns whose widths fit into the capability reg
 
 
 class BM1Kind(MachineKind):
-    """Exact inference with approximate computations: a line of AND gates for each searched value (thesis 2.1.2)."""
+    """The BM1 (thesis 2.1.2): exact inference, computed approximately by a line of AND gates per searched value."""
 
     name = "BM1"
     has_hardware = True

@@ -299,13 +299,13 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
     ends: Integers,
     limits: tuple[int, ...],
 ) -> bool:
-    """Run sliced chains to their ends, and store the number of cycles of each chain in `ends`.
+    """Run bit-sliced chains until each has drawn its samples, and store the number of cycles of each chain in `ends`.
 
-    Return False if a chain may reach a limit before its end.
+    Return False if `max_cycles` or the timeout of the OPS may stop a chain before that.
 
-    `vectors` contains `numbers`, `values`, `pointed`, `counts` and `room`. `counts` has a counter for each
-    state. The counters of states 1 and up count samples. The counter of state 0 counts sweeps instead, and overflows at
-    the end of the burn-in and at the end of the chain.
+    `vectors` contains `numbers`, `values`, `pointed`, `counts` and `room`. `counts` has a counter for each joint value
+    of the unknown bits, which counts the samples with this value. Only the counter of value 0 counts sweeps instead:
+    it overflows at the end of the burn-in and at the end of the chain.
     `room` is working space for carries, for the bits of contexts, and for the events of a sample.
     """
     numbers, values, pointed, counts, room = vectors
@@ -445,9 +445,9 @@ def run_in_step(  # noqa: PLR0915 - vectors are not passed to functions
 
     Return False as soon as a chain may reach `max_cycles` or `ops_timeout`.
 
-    `numbers` are random numbers, stored in blocks of cycles. The vector `clock` has a value for each chain in three
-    rows: the place of the chain's next cycle in `numbers`, the place where the chain's block ends, and the first
-    cycle of this block.
+    `numbers` are random numbers, stored in blocks of cycles. `clock`, the fourth of `vectors`, has three rows with one
+    value per chain: the index of the chain's next cycle in `numbers`, the index at which the chain's block ends, and
+    the first cycle of this block.
     """
     values, addresses, results, clock, room = vectors
     burn_in, samples, max_cycles, ops_timeout = limits

@@ -1,4 +1,4 @@
-"""A machine kind: the interface of any machine for programming files, boards, drivers and posteriors.
+"""A machine kind: the interface through which programming files, boards, drivers and posteriors use any machine.
 
     host                                                     board
     begin(frame) ──── settings, blocks ────▶ start ──▶ step, step, ... ─┐

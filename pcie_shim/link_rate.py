@@ -28,10 +28,7 @@ def wait_until(tick_ns: int) -> None:
 
 
 class LinkModel:
-    """The wire to a board.
-
-    A shared wire leads to several boards: to all boards whose processes are forked after the wire's creation.
-    """
+    """A simulated wire to a board. All boards whose processes are forked after its creation share a shared wire."""
 
     def __init__(self, wire: LinkFigures, wait: Callable[[int], None] = wait_until) -> None:
         self._wire = wire

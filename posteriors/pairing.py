@@ -23,9 +23,11 @@ class Pairing:
 
     Servers preserve the order of messages within a topic, but not always between topics. If nothing is lost, the
     first waiting posterior belongs to the first waiting report of a published frame. The times of arrival (`heard_ns`)
-    show losses. If the first report arrived more than `disorder_ns` after the posterior, the posterior's own report
-    was lost. The posterior of the first report was lost if two conditions hold: the first report arrived more than
-    `disorder_ns` before the posterior, and the second report is not too late for the posterior.
+    show losses:
+
+    - If the first report arrived more than `disorder_ns` after the posterior, this posterior's report was lost.
+    - If the first report arrived more than `disorder_ns` before the posterior, and the second report no more than
+      `disorder_ns` after it, the first report's posterior was lost.
 
     Attributes:
         announced_only: Number of reports whose posterior never arrived.

@@ -84,7 +84,10 @@ class Plane(NamedTuple):
 
 
 def has_coordinates(dimensions: Sequence[Dimension]) -> bool:
-    """Return whether two coordinates are searched: each is a length, or a unitless number that is not an index."""
+    """Return whether a posterior is over two coordinates.
+
+    A coordinate is a length, or a number that has no unit and is not only an index.
+    """
     return len(dimensions) == 2 and all(
         not each.states and (each.unit in _METRES or (not each.unit and (each.offset, each.step) != (0, 1)))
         for each in dimensions

@@ -43,7 +43,7 @@ class Settings(BaseModel):
     )
     use_sim_time: bool = Field(
         default=False,
-        description="Readings age by the simulated time on /clock, and those without a stamp get it.",
+        description="Measure the age of readings in the simulated time of /clock, and stamp readings without a stamp with it.",
     )
     queue: Annotated[Literal["latest", "all"] | None, Flag(otherwise=_DEPLOYMENTS)] = Field(
         default=None,
@@ -83,7 +83,7 @@ class Settings(BaseModel):
 
     read_results: bool = Field(
         default=False,
-        description="Read the results of the boards started here from their registers, as on hardware, not with their interrupts.",
+        description="Read the results of the boards started here from their registers, as on hardware, instead of taking them from their interrupts.",
     )
 
     # --- the processes of a run ---
@@ -126,7 +126,7 @@ class Settings(BaseModel):
     # --- what a process reports ---
     metrics: Annotated[str, Flag(metavar="[HOST:]PORT")] = Field(
         default="",
-        description="Serve metrics for Prometheus, on loopback without a host; a master uses the next ports for its processes.",
+        description="Serve metrics for Prometheus, on loopback unless a host is given; the processes of a master use the next ports.",
     )
     log_level: Literal["info", "warning", "debug"] = Field(
         default="info", description="Log level; debug logs one line per frame."

@@ -1,4 +1,4 @@
-"""The end of a command: it reports an error on standard error and turns the error into an exit code."""
+"""The end of a command: its error is reported on standard error and becomes an exit code."""
 
 import errno
 import os

@@ -70,7 +70,10 @@ def received_stop() -> StoppedError | None:
 
 
 def check_signals() -> None:
-    """Raise a StoppedError if a signal has arrived. Call this before blocking: the signal's exception may be lost."""
+    """Raise a StoppedError if a signal has arrived.
+
+    Call this before blocking, because the exception that the signal raised may have been lost.
+    """
     if stop := received_stop():
         raise stop
 

@@ -138,7 +138,10 @@ class TomlFile:
             raise error(_PLACE.sub("", str(reason)), path=path, line=line) from None
 
     def validated(self, model: type[Model]) -> Model:
-        """Return the tables as a pydantic model, by field aliases. Errors name the line and the nearest valid name."""
+        """Return the tables as a pydantic model, whose aliases are the keys in the file.
+
+        Errors name the line and the nearest valid key.
+        """
         try:
             return model.model_validate(self.tables, by_alias=True, by_name=False)
         except ValidationError as reason:

@@ -231,7 +231,7 @@ def _prepared(pickled: bytes, _thread: int) -> Work:
 
 
 def do_batch(pickled: bytes, numbers: Sequence[int], most_s: float, theirs: str) -> tuple[bytes, float]:
-    """Do pieces on a worker until `most_s` seconds are over, but at least one piece.
+    """Compute pieces of a job on a worker for about `most_s` seconds, and at least one piece.
 
     Return the results and the seconds taken. The results are pickled and compressed, because a posterior is mostly
     zeros, and dask would send the results uncompressed through the scheduler. `theirs` is the client's `software()`.

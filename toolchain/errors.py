@@ -33,7 +33,7 @@ class NotFusionError(ModelError):
     """A BM1 cannot answer a question, because two known symbols are not independent given the searched symbols."""
 
     def __init__(self, why: str, advice: str) -> None:
-        """Join `why` and `advice` to one sentence. `why` names the two symbols and the path between them."""
+        """Join `why` and `advice` into one sentence. `why` names the two symbols and the path between them."""
         super().__init__(f"{why}; {advice}")
         self.why = why
 

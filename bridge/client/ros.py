@@ -94,7 +94,7 @@ class Ros:
         return self._session.reconnections
 
     def reconnect_now(self) -> None:
-        """Try to reconnect now instead of at the next regular attempt, for example if another program could connect."""
+        """Try to reconnect now instead of at the next regular attempt, for example because another program could."""
         self._session.reconnect_now()
 
     @property

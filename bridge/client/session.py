@@ -88,7 +88,10 @@ class Reader(Protocol):
         """Count a message that was discarded because it is larger than `max_bytes`."""
 
     def leave_out(self, reason: str) -> None:
-        """Record that the client leaves the topic out after too large a message. Reading then raises an error."""
+        """Record that the client no longer subscribes to the topic, because a message was too large for a connection.
+
+        After the messages in the queue, reading raises an error with `reason`.
+        """
 
     def add_blind_seconds(self, seconds: float) -> None:
         """After a reconnection, add the seconds without a connection to `blind_seconds`."""

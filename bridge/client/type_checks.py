@@ -64,7 +64,7 @@ class TypeChecks:
     async def check_request(self, service: str, args: Mapping[str, Any], limit: float) -> None:
         """Check a request for a service against the service's type.
 
-        The client asks rosapi for an unknown type. Each question to rosapi takes at most `limit` seconds.
+        The client asks rosapi for an unknown type, and waits at most `limit` seconds for each answer.
 
         Raises:
             MessageTypeError: The request has a field that the type does not have, or an array of another shape.

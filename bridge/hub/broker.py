@@ -119,7 +119,7 @@ class Broker:
         return client
 
     def disconnect(self, client: Client) -> None:
-        """Remove a client, and fail the calls and goals that it has not answered. A second call does nothing."""
+        """Remove a client, and fail the calls and goals that it has not answered. Ignore a client already removed."""
         if self.graph.clients.pop(client.number, None) is None:
             return
         dropped = sum(subscription.lane.dropped for subscription in client.subscriptions.values())

@@ -140,7 +140,7 @@ class Offer:
     type: str
     client: Client
     fillers: Mapping[str, Filler]
-    """For each part of the type, such as `Request`, the filler of absent fields. Empty if the type is unknown."""
+    """Fillers of absent fields, by the part of the type, such as `Request`. Empty if the type is unknown."""
 
 
 class Graph:

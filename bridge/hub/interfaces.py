@@ -171,7 +171,10 @@ def part_name(type_name: str, part: str, ros_version: RosVersion) -> str:
 
 @cache
 def message_texts(ros_version: RosVersion) -> dict[str, str]:
-    """Return message definitions by name (such as `tf2_msgs/msg/TFMessage`), with the parts of services and actions."""
+    """Return the text of each message definition by name, such as `tf2_msgs/msg/TFMessage`.
+
+    Each part of a service or an action, such as its request, has an entry of its own.
+    """
     rosapi = "rosapi_msgs" if ros_version == 2 else "rosapi"
     own = _ROSAPI | (_ROSAPI_2 if ros_version == 2 else {})
     services = _SERVICES | {f"{rosapi}/{name}": text for name, text in own.items()}

@@ -4,7 +4,7 @@ The owner of the socket drains the outbox as fast as the socket accepts data. Wh
 newer messages of a topic replace older messages in the outbox. A slow client does not slow down other clients.
 Answers and requests of services are never dropped. If they exceed the bound, the client has *overflowed*.
 
-A dropped message leaves a gap in the queue, so dropping takes no longer than sending. If a client requested
+Dropping a message only empties its entry in the queue, so it is as fast as sending. If a client requested
 fragments, each message is queued whole. The message counts towards the bound until its last fragment is sent.
 """
 

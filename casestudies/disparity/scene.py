@@ -19,7 +19,7 @@ FOCAL: Final = 1.0
 NOISE: Final = 1.5
 """Standard deviation of the cameras' noise, in grey levels."""
 RIGHT_GAIN: Final = 0.95
-"""Brightness of the right image relative to the left image, because real cameras also differ."""
+"""Brightness of the right image relative to the left image. Real cameras also differ in brightness."""
 _OCTAVES: Final = tuple(1.6 / 2**octave for octave in range(8))
 """Periods of the texture, in metres."""
 _TOLERANCE: Final = 1e-6

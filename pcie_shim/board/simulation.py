@@ -22,7 +22,7 @@ MOST_WORDS: Final = 256
 ACCESS_CLOCKS: Final = 8
 """Maximum number of clocks that an access takes after the hardware has filled its memories."""
 ANSWER_S: Final = 20.0
-"""Seconds that are added to ten times the expected duration of a request. The sum is the timeout of the answer."""
+"""The timeout of an answer is this many seconds plus ten times the expected duration of the request."""
 START_S: Final = 600.0
 """Timeout of the first answer in seconds. Before the first answer, the simulator elaborates the hardware."""
 

@@ -170,7 +170,7 @@ class MiniCluster:
         self._open(self._boards[board], self._timeout if timeout is None else timeout)
 
     def close(self) -> None:
-        """Close all links. Boards that are running stop."""
+        """Close all links. This stops the boards that are running."""
         self._progress = None
         for board in self._boards:
             self._close(board, "the mini-cluster was closed")

@@ -342,7 +342,7 @@ class SocketLink:
         return self._give_up(SequenceError("an answer arrived without a request"))
 
     def request(self, operation: int, flags: int, address: int, count: int, payload: Octets = b"") -> Frame:
-        """Send one request, and return the board's answer. An interrupt that arrives before the answer is stored.
+        """Send one request, and return the board's answer. If an interrupt arrives first, store it for `take_done`.
 
         The payload of the answer is valid until the link receives again.
         """

@@ -23,7 +23,10 @@ def same_shape(frames: Sequence[KeptFrame], shown: KeptFrame | None) -> list[Kep
 
 
 def archive(frames: Sequence[KeptFrame], axes: Sequence[Axis]) -> bytes:
-    """Return at least one frame as an archive for `numpy.load`. Array names are as in `listen --save`."""
+    """Return frames as an archive for `numpy.load`, with the array names of `listen --save`.
+
+    `frames` must not be empty.
+    """
     file = io.BytesIO()
     write_archive(
         file,
@@ -37,7 +40,10 @@ def archive(frames: Sequence[KeptFrame], axes: Sequence[Axis]) -> bytes:
 
 
 def table(frames: Sequence[KeptFrame]) -> bytes:
-    """Return at least one frame as a CSV table. A row has the frame's most probable cell and all its probabilities."""
+    """Return frames as a CSV table, one row per frame, with the most probable cell and all probabilities.
+
+    `frames` must not be empty.
+    """
     labels, first = frames[0].labels, frames[0].values
     cells = cell_names(labels, first.shape) if first is not None else ()
     file = io.StringIO(newline="")

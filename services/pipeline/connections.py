@@ -67,7 +67,7 @@ async def connect_all(
 
 
 def reconnect_now(rosbridges: Mapping[str, Ros]) -> None:
-    """Try to reconnect to all lost servers at once. Services do this when another service has reached a server."""
+    """Retry all lost servers immediately. A service does this when the master reports that the other is connected."""
     for ros in rosbridges.values():
         ros.reconnect_now()
 

@@ -95,7 +95,10 @@ class ResultTopics:
             yield f"publishing on {topics} at {', '.join(by_uri)}"
 
     def served_by(self, uri: str) -> tuple[str, str]:
-        """Return two texts about a server: its topics and its name. With a single server, the first text is empty."""
+        """Return two parts of a sentence about a server, such as ` for /BMresults` and `rosbridge at ws://robot:9090`.
+
+        With a single server, the parts are an empty text and `rosbridge`.
+        """
         if len(self.rosbridges) == 1:
             return "", "rosbridge"
         topics = [publication.topic for ros, publication in self._outputs if ros is self.rosbridges.get(uri)]

@@ -1,8 +1,8 @@
-"""The synchroniser. It pairs messages of several topics by their stamps.
+"""The synchroniser. It groups the messages of several topics into sets by their stamps.
 
 The synchroniser does not read a clock: the caller passes the time with every call. Add the messages of one topic in
-the order in which they were sent. The order between topics is free: the sets do not depend on it if delays differ
-by less than the tolerance.
+the order in which they were sent. Messages of different topics may be added in any order: the sets stay the same, as
+long as the delays of the topics differ by less than the tolerance.
 
 The period of a topic is the median of the topic's last intervals. A topic is *alive* until it is silent for
 `ALIVE_PERIODS` of its periods.

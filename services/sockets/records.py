@@ -181,7 +181,7 @@ class FrameRequest(Record, tag="frame", frozen=True):
 
 
 class FrameResult(Record, tag="result", frozen=True):
-    """pcie-app sends the master the boards' results, durations, and the bytes and transfers on the links.
+    """pcie-app sends the master the boards' results, the durations, and the traffic on the links.
 
     `boards` is an encoded list of `machines.kind.BoardResult`. A master without a filter forwards it without decoding.
     """
@@ -248,9 +248,9 @@ class Published(Record, tag="published", frozen=True):
 
 
 class Seen(Record, tag="seen", frozen=True):
-    """With `--loop`, the publisher tells the master whether one of its own results came back in time.
+    """With `--loop`, the publisher tells the master whether the server sent a published result back in time.
 
-    If no result came back in time, a second `Seen` follows as soon as a later result comes back.
+    If it sent none back in time, a second `Seen` follows as soon as a later result comes back.
     """
 
     seen: bool

@@ -173,7 +173,10 @@ def check_metrics(metrics: str, *, insecure: bool) -> None:
 
 
 def shifted(metrics: str, ports: int) -> str:
-    """Return `metrics` with `ports` added to its port, for another process of the run. An empty address stays empty."""
+    """Return the address `metrics` with a port that is higher by `ports`, for another process of the run.
+
+    An empty address stays empty.
+    """
     if not metrics:
         return ""
     endpoint = metrics_endpoint(metrics)
@@ -218,6 +221,6 @@ async def _keep_sampling(report: Report, manager: ServiceManager) -> None:
 def serve_status_in_thread(
     directory: Path | None, name: str, get_status: GetStatus, **more: Any
 ) -> Iterator[None]:
-    """Report the status from another thread within the context. Use it in a process whose main thread blocks."""
+    """While the context is open, serve the status from another thread, for a process whose main thread blocks."""
     with in_thread(lambda: serve_status(directory, name, get_status, **more)):
         yield

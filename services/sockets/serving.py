@@ -210,8 +210,8 @@ def listening(
     """Return the function that creates a link over a local socket at the endpoint of `--listen`.
 
     Raises:
-        SettingsError: `listen` is not an endpoint. If `insecure` is False, also if other machines could reach the link
-            or the metrics.
+        SettingsError: `listen` is not an endpoint. Or other machines could reach the link or the metrics, and
+            `insecure` is False.
     """
     check_metrics(settings.metrics, insecure=insecure)
     endpoint = endpoint_from(listen, "--listen")
@@ -276,7 +276,10 @@ async def report_failure(link: Link, error: BaseException) -> None:
 
 
 def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None:
-    """If the folder has the deployment of the `refused` hello, return an error that advises a restart, else None."""
+    """Return an error that advises a restart, if the deployment's folder was rebuilt since this process loaded it.
+
+    Return None if the folder does not contain the deployment that the master's `refused` hello names.
+    """
     if not isinstance(refused, Hello) or refused.deployment_hash == deployment.hash:
         return None
     try:
@@ -344,7 +347,12 @@ def board_endpoints(settings: Settings, deployment: Deployment) -> list[Endpoint
 
 
 def board_endpoint(text: str, where: str, settings: Settings) -> Endpoint:
-    """Return the endpoint of a board, with the settings' key on TCP, or raise a SettingsError or CredentialsError."""
+    """Parse the endpoint of a board. A TCP endpoint also gets the key from `settings.key_file`, if that is set.
+
+    Raises:
+        SettingsError: `text` is not an endpoint. The error says that `text` comes from `where`.
+        CredentialsError: The key file cannot be used.
+    """
     endpoint = endpoint_from(text, where)
     if not endpoint.host or settings.key_file is None:
         return endpoint

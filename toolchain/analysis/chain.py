@@ -186,9 +186,9 @@ class ChainError:
     share: float
     """The total probability of the examined readings. The most probable readings are examined."""
     quantising: float
-    """Mean distance of the stationary law's posterior from exact inference, over the examined readings."""
+    """Mean distance between the stationary law's posterior and exact inference, over the examined readings."""
     worst: float
-    """Largest distance of the stationary law's posterior from exact inference, over the examined readings."""
+    """Largest distance between the stationary law's posterior and exact inference, over the examined readings."""
     worst_reading: tuple[int, ...]
     """The reading with the distance `worst`: one address per known variable."""
     start: float

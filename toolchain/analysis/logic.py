@@ -176,7 +176,7 @@ def state_bits(p: BM1Parameters | BM2Parameters, table_length: int) -> int:
 def logic_of(parameters: BM1Parameters, *, table_length: int = LENGTH, inputs: int = 0) -> Logic:
     """Return the logic of a machine on a board, without memories. Raises a BuildError for ideal generators.
 
-    If the board's registers have more input words than the machine needs, `inputs` is the number of these words.
+    `inputs` is the number of all input words in the board's registers, if it is more than the machine needs.
     """
     p = parameters
     if p.rng is RngKind.IDEAL:
@@ -274,7 +274,7 @@ class EqualMemories:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Memories:
-    """The memories of a machine. `logic_tables` counts the tables in memory LABs, for which no block was left."""
+    """The memories of a machine. `logic_tables` tables are in memory LABs, because all M20K blocks are used."""
 
     table_bits: int
     blocks: int

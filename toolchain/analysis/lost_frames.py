@@ -56,9 +56,9 @@ def lost_frames(plan: MachinePlan, quantised: Quantised) -> LostFrames:
     chances = _chances(plan, quantised, drawn)
     share = _share(chances, plan.options, plan.max_cycles)
     what = (
-        f"{share:.1%} of {frames} frames drawn from the model get no posterior, as computed from the codes: in "
-        f"{(chances == 0).mean():.1%} of all frames every line has a code 0, and in the rest of the {share:.1%} "
-        f"no line counts in {plan.max_cycles} cycles"
+        f"of {frames} frames drawn from the model, {share:.1%} are expected to get no posterior: "
+        f"{(chances == 0).mean():.1%} because every line has a code 0, and the rest because no line counts in "
+        f"{plan.max_cycles} cycles"
     )
     return LostFrames(share, what, _advice(plan, drawn) if share > TOLERATED else "")
 
@@ -129,7 +129,7 @@ def _advice(plan: MachinePlan, drawn: Readings) -> str:
         if share <= TOLERATED or count <= 1:
             ways.append((flags or "another model", share))
         count = count * 3 // 4
-    return "use " + " or ".join(f"{flags} ({share:.2%} expected)" for flags, share in ways) + more
+    return "use " + " or ".join(f"{flags} (then {share:.2%})" for flags, share in ways) + more
 
 
 def _expected(

@@ -198,8 +198,8 @@ def replay(
     """Compute all frames that an interrupted run has not computed, and write the output.
 
     First, `begun` is called with the number of frames from the interrupted run. After each further frame, `advance` is
-    called. If a frame depends on earlier frames, this process computes all frames. Return the number of frames computed
-    now, and the number of all frames without a posterior.
+    called. If a frame depends on earlier frames, the frames are computed in order in this process, without `run`.
+    Return the number of frames computed now, and the number of all frames without a posterior.
 
     Raises:
         BuildError: A file cannot be written, or belongs to another recording, deployment or version.

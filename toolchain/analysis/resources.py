@@ -73,8 +73,8 @@ def estimate(
 ) -> Estimate:
     """Return the resources of a machine on a device. Raises a BuildError if the machine exists only in emulation.
 
-    If the board's registers have more input words than the machine needs, `inputs` is their number. Results take no
-    memory, because they are counters.
+    `inputs` is the number of all input words in the board's registers, if it is more than the machine needs. Results
+    take no memory, because they are counters.
     """
     return Estimate(
         device=device,

@@ -48,7 +48,7 @@ TARGET_COUNT: Final = typer.Option(
 
 @dataclass(frozen=True, kw_only=True)
 class TargetOptions:
-    """The flags of a build about the source of the readings and the destination of the posteriors."""
+    """The flags of a build that say where readings come from and where posteriors go."""
 
     uri: Annotated[str, URI] = ""
     topic: Annotated[str, TOPIC] = ""

@@ -55,9 +55,7 @@ def memories(
     flags: ModelFlags,
     model: Annotated[
         Path | None,
-        typer.Option(
-            help="Use the tables of the current model; without it, those of the images.", metavar="MODEL"
-        ),
+        typer.Option(help="Use the tables of this model; by default, those in the images.", metavar="MODEL"),
     ] = None,
     verbose: Verbose = False,
 ) -> None:

@@ -170,9 +170,9 @@ def _case_source(path: Path, flags: ModelFlags, settings: dict[str, str]) -> "Mo
 def build_options(
     flags: BuildFlags, target: TargetOptions, sources: Path | None = None, *, is_checked: bool = False
 ) -> BuildOptions:
-    """Return the options of a build. For several topics, the file `sources` replaces the flags of a topic.
+    """Return the options of a build. For several topics, the file `sources` replaces `--topic` and `--type`.
 
-    With `is_checked`, the flags that name the topic of the readings may be missing.
+    With `is_checked`, `--uri`, `--topic` and `--type` may be missing.
     """
     from toolchain.outputs.mif import read_table
 

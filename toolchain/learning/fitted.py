@@ -83,7 +83,8 @@ class Fit:
 def with_fit(model: Model, path: Path | None) -> Model:
     """Return the model with tables from the fit file `path`. Without a path, return the model unchanged.
 
-    Raises a ModelError if the fit is for another model. Only a fit of normal distributions may be for another grid.
+    Raises a ModelError if the fit is for another model. A fit of normal distributions may come from another grid, a
+    fit of counts may not.
     """
     return model if path is None else apply_fit(model, read_fit(path), str(path))
 

@@ -202,7 +202,7 @@ class Symbol:
 
     @property
     def reading(self) -> dict[str, Any]:
-        """The arguments for `Known` or `PriorSelect` that the symbol defines."""
+        """Those keyword arguments of `Known` or `PriorSelect` that the symbol defines."""
         return {
             "name": self.name,
             "bits": self.bits,

@@ -49,7 +49,7 @@ class Scanner:
     def next(self) -> str:
         """Consume and return the next token. Return an empty string at the end of the text.
 
-        A token is a word, a quoted word without its quotes, or a sign.
+        A token is a word, a quoted word without its quotes, or a sign such as `{`.
         """
         match = self._token.match(self._text, self._end)
         if match is None:  # the last alternative matches any character
@@ -81,7 +81,10 @@ class Scanner:
         return found
 
     def words(self, end: str, what: str, most: int) -> list[str]:
-        """Consume and return at most `most` words up to the sign `end`. Commas between words are optional."""
+        """Consume words up to the sign `end`, and return them. More than `most` words are an error.
+
+        Commas between words are optional.
+        """
         found: list[str] = []
         while True:
             piece = self.next()

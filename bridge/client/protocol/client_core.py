@@ -74,8 +74,9 @@ class ClientCore:
     def receive(self, data: bytes, now: float) -> Event | None:
         """Return the event in a WebSocket message; `now` is in monotonic seconds.
 
-        Return None if a request was refused here, or if the topic or call of a message no longer exists.
-        Also return None for all fragments of a message but the last. Invalid data gives an `UnusableReceived`.
+        Return None if this client refused the call or goal that arrived, or if the message belongs to a topic, call
+        or goal that no longer exists. Also return None for all fragments of a message but the last. Invalid data
+        gives an `UnusableReceived`.
         """
         # The usual case: a message of a topic that had one before.
         known, subscriptions = self.receive_known((data,), 0, 0, 0)

@@ -271,7 +271,7 @@ class Subscriptions:
         return bool(waiting)
 
     def silent(self) -> list[str]:
-        """Return the topics subscribed to with a type that have delivered no message on this connection."""
+        """Of the subscriptions that name a type, return the topics that are without a message on this connection."""
         return [
             s.topic
             for s in self._subscribed.values()
@@ -338,7 +338,10 @@ class Subscriptions:
         return received, subscribed.numbers
 
     def discard_known(self, data: bytes) -> MessageDiscarded | None:
-        """Discard an unparsed message with a known envelope if it exceeds its topic's limit. Otherwise return None."""
+        """If an unparsed message with a known envelope is larger than its topic's limit, return a `MessageDiscarded`.
+
+        Otherwise return None.
+        """
         known = self.envelopes.get(envelope_of(data))
         is_usable = len(data) <= self._wire.max_size
         return known.subscribed.measure(known.topic, len(data)) if known is not None and is_usable else None

@@ -69,7 +69,7 @@ def test_few_lost_frames_need_no_advice():
 def test_the_advised_options_save_as_many_as_they_say(count, changes, ways):
     model, options = posts(count), replace(OPTIONS, **changes)
     advice = predicted(model, options).advice
-    offered = re.findall(r"(--[^(]+) \(([\d.]+)% expected\)", advice)
+    offered = re.findall(r"(--[^(]+) \(then ([\d.]+)%\)", advice)
     assert offered
     assert any(flags.startswith(way) for flags, _ in offered for way in ways), advice
     for flags, percent in offered:
