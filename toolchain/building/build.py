@@ -41,6 +41,7 @@ from toolchain.building.report import bm2_report, build_report
 from toolchain.building.sources import placed
 from toolchain.deployment import (
     FILE_NAME,
+    UNFINISHED,
     BM1Section,
     BM2Section,
     BoardSection,
@@ -108,7 +109,7 @@ def build_deployment(
         text_file(FILE_NAME, deployment_text(built.deployment)),
     )
     # While it exists, the files in the folder are those of an unfinished build, which the next build may replace.
-    unfinished = directory / f"{FILE_NAME}.unfinished"
+    unfinished = directory / UNFINISHED
     with file_errors(directory, "written", BuildError, "; choose another folder with -o"):
         directory.mkdir(parents=True, exist_ok=True)
         if (directory / FILE_NAME).is_file():

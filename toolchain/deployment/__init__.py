@@ -3,6 +3,7 @@
 from toolchain.deployment.deployment import (
     FILE_NAME,
     REPLICA,
+    UNFINISHED,
     Deployment,
     DeploymentFile,
     deployment_hash,
@@ -31,6 +32,7 @@ from toolchain.deployment.sections import (
 __all__ = [
     "FILE_NAME",
     "REPLICA",
+    "UNFINISHED",
     "BM1Section",
     "BM2Section",
     "BoardSection",

@@ -37,6 +37,8 @@ if TYPE_CHECKING:
 
 FORMAT: Final = 1
 FILE_NAME: Final = "deployment.toml"
+UNFINISHED: Final = f"{FILE_NAME}.unfinished"
+"""Name of a file that a folder has while a build writes the folder, and after a build that was interrupted."""
 FORMER_KEYS: Final = frozenset({"integrity", "integrity_frames"})
 """Keys of a check that no longer exists. Files of earlier builds may have the keys. The hash never included them."""
 MOST_TRANSITIONS: Final = 2**24
@@ -260,6 +262,10 @@ def load_deployment(
             f"{directory} is a file; give the folder written by 'toolchain build', here perhaps {directory.parent}"
         )
     if not path.is_file():
+        if (directory / UNFINISHED).exists():
+            raise DeploymentError(
+                f"the build of {directory} has not ended or was interrupted; repeat that 'toolchain build'"
+            )
         raise DeploymentError(
             f"{directory} does not contain a deployment: {path} does not exist; create one with 'toolchain build'"
         )
