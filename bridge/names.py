@@ -51,7 +51,7 @@ def ros2_type(name: str, kind: Kind = "msg") -> str:
 def same_type(one: str, other: str) -> bool:
     """Return whether two type names denote the same type. Each name may have the form of ROS 1 or ROS 2.
 
-    A malformed name denotes the same type only as an equal name.
+    If a name is malformed, the result is True only if the two names are equal.
     """
     if one == other:
         return True

@@ -118,8 +118,8 @@ async def report_refused(
 class LossyPublication:
     """A publication that drops messages while the server is disconnected or slow.
 
-    A message that is too large for the server is also dropped. The user is warned once of a slow server and once of a
-    large message. After a message has been published, the next drop is warned of again.
+    A message that is too large for the server is also dropped. The user gets one warning about a slow server, and one
+    about a message that is too large. After a message has been published, each warning may come again.
     """
 
     def __init__(self, publication: Publication) -> None:

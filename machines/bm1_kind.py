@@ -128,7 +128,10 @@ class BM1Kind(MachineKind):
         return _OnHost(machines)
 
     def joint_reason(self, reasons: Sequence[int]) -> int:
-        """Return OVERFLOW, MAX_CYCLES or IMPOSSIBLE, the first in this order that a replica has, or otherwise SLICE."""
+        """Return the first of OVERFLOW, MAX_CYCLES and IMPOSSIBLE that any replica has.
+
+        If no replica has one of these reasons, return SLICE.
+        """
         joint = joint_reason([StopReason(reason) for reason in reasons], range(len(reasons)))
         return joint if joint is not StopReason.NONE else StopReason.SLICE
 

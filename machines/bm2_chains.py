@@ -304,8 +304,8 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
     Return False if `max_cycles` or the timeout of the OPS may stop a chain before that.
 
     `vectors` contains `numbers`, `values`, `pointed`, `counts` and `room`. `counts` has a counter for each joint value
-    of the unknown bits, which counts the samples with this value. Only the counter of value 0 counts sweeps instead:
-    it overflows at the end of the burn-in and at the end of the chain.
+    of the unknown bits. The counter of value 0 counts sweeps, and overflows at the end of the burn-in and at the end of
+    the chain. Every other counter counts the samples with its value.
     `room` is working space for carries, for the bits of contexts, and for the events of a sample.
     """
     numbers, values, pointed, counts, room = vectors
@@ -443,11 +443,11 @@ def run_in_step(  # noqa: PLR0915 - vectors are not passed to functions
 ) -> bool:
     """Run chains in step until each chain has drawn its samples, and return True.
 
-    Return False as soon as a chain may reach `max_cycles` or `ops_timeout`.
+    Return False as soon as `max_cycles` or `ops_timeout` may stop a chain. The results are then incomplete.
 
-    `numbers` are random numbers, stored in blocks of cycles. `clock`, the fourth of `vectors`, has three rows with one
-    value per chain: the index of the chain's next cycle in `numbers`, the index at which the chain's block ends, and
-    the first cycle of this block.
+    `numbers` contains random numbers. For each chain, it contains a block of consecutive cycles. `clock`, the fourth
+    of `vectors`, has three rows with one value per chain: the index in `numbers` of the chain's next cycle, the index
+    in `numbers` at which the chain's block ends, and the number of the first cycle in the block.
     """
     values, addresses, results, clock, room = vectors
     burn_in, samples, max_cycles, ops_timeout = limits

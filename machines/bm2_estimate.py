@@ -11,7 +11,7 @@ import numpy.typing as npt
 from machines.bm2 import BM2Parameters, BM2StopReason, unpack_all
 
 BATCHES_MIN: Final = 20
-"""Minimum number of batches for an estimate of the effective samples from the means of batches."""
+"""With fewer batches, the number of effective samples is not estimated from the means of the batches."""
 
 AGREE: Final = 1.1
 """Maximum R-hat at which boards count as agreeing on one distribution (Gelman and Rubin 1992)."""
@@ -25,8 +25,8 @@ class BoardSamples:
 
     Attributes:
         reason: The board's last stop reason.
-        counts: uint32[batches, values], the number of samples with each joint value of the searched variables. The
-            counts of a batch cover the frame up to the end of the batch.
+        counts: uint32[batches, values], the number of samples with each joint value of the searched variables. Each
+            row counts the samples from the start of the frame to the end of the batch.
         values: int[samples], the index of each sample's joint value. The index is -1 if a variable has an unused code.
             `values` is None if the board does not stream samples.
     """

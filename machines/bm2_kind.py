@@ -1,7 +1,7 @@
 """BM2 as a machine kind: sections of the programming file, registers, frames and posteriors (thesis 2.1.3).
 
-After each start or resume, a board draws one batch of samples. A board that stores samples in a stream draws as many
-as the stream's buffer holds.
+After each start or resume, a board without a stream draws one batch of samples. A board with a stream draws samples
+until the buffer of the stream is full.
 """
 
 import math
@@ -38,9 +38,9 @@ STREAM_WORDS_MAX: Final = 4096
 """Maximum number of words in the stream's buffer. It is the size of the block STREAM in the register map."""
 
 BATCHES: Final = 20
-"""Number of batches into which the samples of a frame without a stream are divided.
+"""Number of batches into which a frame's samples are divided, if the boards do not stream their samples.
 
-The means of the batches show how much samples depend on each other.
+The variation between the means of the batches shows how much the samples depend on each other.
 """
 
 STREAM_BYTES_MAX: Final = 3 << 20

@@ -70,7 +70,11 @@ class SensorMode(StrEnum):
 
 
 class Sequencer(StrEnum):
-    """Order in which a BM2 draws unknown bits. `coloured` draws one bit of each variable of one colour at once."""
+    """Order in which a BM2 draws unknown bits.
+
+    With `coloured`, variables in a common factor have different colours. A BM2 then draws several bits at once: one bit
+    of each variable that has the same colour.
+    """
 
     LINEAR = "linear"
     RANDOM = "random"

@@ -57,7 +57,7 @@ class VariableReading(NamedTuple):
     """The reading of a variable in a frame."""
 
     value: Annotated[float | str, BeforeValidator(_number_or_text)]
-    """The received value, to nine digits. It is a str if it is the name of a state, infinite or NaN."""
+    """The received value: a float to nine digits, or a str for the name of a state, infinity or NaN."""
     address: int
     """Address in the variable's column."""
     age_ms: FiniteFloat

@@ -23,11 +23,11 @@ class Pairing:
 
     Servers preserve the order of messages within a topic, but not always between topics. If nothing is lost, the
     first waiting posterior belongs to the first waiting report of a published frame. The times of arrival (`heard_ns`)
-    show losses:
+    show losses. Let P be the first waiting posterior, and let R1 and R2 be the first two waiting reports:
 
-    - If the first report arrived more than `disorder_ns` after the posterior, this posterior's report was lost.
-    - If the first report arrived more than `disorder_ns` before the posterior, and the second report no more than
-      `disorder_ns` after it, the first report's posterior was lost.
+    - If R1 arrived more than `disorder_ns` after P, the report of P was lost.
+    - If R1 arrived more than `disorder_ns` before P, and R2 arrived no later than `disorder_ns` after P, the posterior
+      of R1 was lost.
 
     Attributes:
         announced_only: Number of reports whose posterior never arrived.

@@ -17,7 +17,7 @@ class ToolchainError(Exception):
         line: int | None = None,
         place: tuple[str | int, ...] = (),
     ) -> None:
-        """Prefix the sentence with path and line. `place` is the wrong key, such as `("variable", 2, "bits")`."""
+        """Prefix the sentence with path and line. `place` locates a wrong value, such as `("variable", 2, "bits")`."""
         where = f"{path}" + ("" if line is None else f", line {line}")
         super().__init__(f"{where}: {sentence}" if where else sentence)
         self.path = path

@@ -94,7 +94,10 @@ class Ros:
         return self._session.reconnections
 
     def reconnect_now(self) -> None:
-        """Try to reconnect now instead of at the next regular attempt, for example because another program could."""
+        """If the connection is lost, try to reconnect at once, without waiting for the next regular attempt.
+
+        For example, call this method when another program has just connected to the same server.
+        """
         self._session.reconnect_now()
 
     @property

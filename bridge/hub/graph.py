@@ -17,7 +17,7 @@ from bridge.hub.outbox import Lane, Outbox
 
 @dataclass(eq=False, slots=True)
 class Client:
-    """A connected client. The key of a call or a goal is an id that the hub assigns."""
+    """A connected client. The hub assigns an id to each call and each goal. The fields call this id the key."""
 
     number: int
     """The number of the client: 1, 2, ... in the order of connection."""
@@ -55,9 +55,9 @@ class Client:
     status_lane: Lane | None = None
     """The queue of status messages to the client, or None before the first status message."""
     last_published: "Advertisement | None" = None
-    """The advertisement of the client's last message with a known envelope. Its envelope is the first to be tried."""
+    """The advertisement whose envelope was learnt or used last. The hub tries this envelope first."""
     envelopes: dict[bytes, "Advertisement"] = field(default_factory=dict)
-    """The client's advertisements by envelope: the bytes of a publish operation before the message."""
+    """The client's advertisements by envelope. An envelope is the part of a publish operation before the message."""
     close_reason: str = ""
     """Reason why the hub must disconnect the client, or empty."""
     is_ready: bool = False
@@ -103,7 +103,7 @@ class TopicSubscription:
     client: Client
     topic: "Topic"
     prefix: bytes
-    """The bytes before each message in the JSON that the client receives. They contain `name`."""
+    """The beginning of each publish operation sent to the client as JSON, up to the message. The topic is `name`."""
     name: str
     """The topic's name as the client writes it, with or without the leading slash."""
     lane: Lane = field(default_factory=Lane)
@@ -121,7 +121,7 @@ class Topic:
     name: str
     """Absolute name."""
     largest: int
-    """Maximum size of a message's JSON in bytes: the maximum of an operation minus the bytes around the message."""
+    """Maximum size of a message as JSON, in bytes: that of an operation, minus the bytes around the message."""
     type: str = ""
     """Type in the form of this hub's ROS version, or an empty string while no client has named a type."""
     advertisements: dict[Client, Advertisement] = field(default_factory=dict)

@@ -61,9 +61,9 @@ class HubLimits:
         topics: Number of topics of all clients together.
         advertisements_per_client: Open advertise operations (topic and id) of one client.
         subscriptions_per_client: Open subscribe operations (topic and id) of one client.
-        services_per_client: Services that one client offers, and as many actions.
-        calls_per_client: Open calls that one client made, and as many that it must answer.
-        goals_per_client: Open goals that one client sent, and as many that it executes.
+        services_per_client: Services that one client offers. The same bound holds for its actions.
+        calls_per_client: Open calls that one client made. The same bound holds for calls that the client must answer.
+        goals_per_client: Open goals that one client sent. The same bound holds for goals that the client executes.
         call_timeout: Time after which a call without an answer fails. A client may request a shorter time.
         queue_length: Messages of a topic queued for a slow client that did not request a length. A further
             message replaces the oldest.

@@ -51,7 +51,10 @@ class WebSocketTransport(asyncio.Protocol):
     slice_bytes: ClassVar[int] = sys.maxsize
 
     def __init__(self, protocol: ClientProtocol | ServerProtocol, *, max_size: int, write_limit: int) -> None:
-        """Prepare the connection. `protocol` must have this `max_size`. `write_limit` unsent bytes set `paused`."""
+        """Prepare the connection. `protocol` must have the same `max_size`.
+
+        `paused` becomes true when more than `write_limit` bytes are unsent.
+        """
         # Monotonic seconds of the last data from the peer, whatever it was.
         self.last_heard = time.monotonic()
         # True while messages can be sent. It copies the library's state, which takes longer to look up, after each

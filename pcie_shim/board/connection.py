@@ -167,7 +167,7 @@ class HostConnection(Connection):
         programmed: int,
         link: LinkModel | None,
     ) -> None:
-        """Store the greeting's token, and `programmed`, the number of images that the board has loaded so far."""
+        """Store `token`, the token in the greeting, and `programmed`, the number of images loaded by the board."""
         super().__init__(connection, key, greeting, link)
 
         # A loader that shows this token may program the board although this host holds it: it is the same host.

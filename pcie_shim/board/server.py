@@ -36,7 +36,7 @@ _LOG: Final = logging.getLogger(__name__)
 PROGRAMMING_SILENCE_S: Final = 10.0
 """If the loader sends no frame for this many seconds, another loader may program the board."""
 MAX_SILENT: Final = 16
-"""Maximum number of connections without a request per port. A further connection replaces the oldest."""
+"""Maximum number of connections to a port that have sent no request yet. A further connection replaces the oldest."""
 
 _HELD: Final = "another host holds it; only one host can drive a board at a time"
 _PROGRAMMED: Final = "another loader is programming it"

@@ -275,9 +275,9 @@ class DrivenBoard:
         """Store the answer of a board that is done. The interrupt carried the answer, or `ask` has requested it.
 
         This host holds the board, so no other host starts the machine. But if the board is reset or switched off
-        between the interrupt and the reads, the results are cleared. `ask` therefore reads the registers from DONE to
-        COMPUTE_NS last. If number, status and cycles still equal the interrupt's values, the blocks contain this
-        frame's results. Otherwise, a SequenceError is raised.
+        between the interrupt and the reads, the results are cleared. `ask` therefore reads the results first, and then
+        the registers from DONE to COMPUTE_NS. If DONE, STATUS and CYCLES still have the values that the interrupt
+        reported, the results belong to this frame. Otherwise, a SequenceError is raised.
         """
         done = self._answered()
         words = done.results

@@ -49,8 +49,9 @@ class FrameOutput:
         register_writes_ns: Time for posting settings, sensors, starts and resumes.
         compute_ns: Time spent waiting for the boards, for computing and for transport.
         reads_ns: Time for reading the results, or for copying results that came with the interrupts.
-        boards_compute_ns: Computing time of the slowest board, summed over the slices. `compute_ns` is longer by the
-            transport. If several emulated boards share a core, it also contains the time of the other boards.
+        boards_compute_ns: Computing time of the slowest board of each slice, summed over the slices. Unlike
+            `compute_ns`, `boards_compute_ns` does not contain the transport. If emulated boards share a core,
+            `boards_compute_ns` also contains computing times of the other boards on the core.
         slices: Number of slices.
         link_bytes: Bytes between the host and all boards, in both directions, with the headers of the link.
         link_transfers: Number of transfers between the host and all boards.

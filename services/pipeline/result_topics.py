@@ -146,7 +146,7 @@ class ResultTopics:
     async def publish(self, publish: Publish, *, look: bool) -> Published:
         """Wait until the servers accept messages, then publish a frame's report and, if there is one, its posterior.
 
-        With `look`, then wait until the result comes back from the server, or for the seconds of `seen_timeout`.
+        With `look`, also wait until the server sends the posterior back. The setting `seen_timeout` limits this wait.
         """
         inference = infer(publish.result, self._deployment)
         # a server that does not accept the result in time does not get it, and the user is warned

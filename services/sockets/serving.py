@@ -207,11 +207,11 @@ class MasterLink(Link):
 def listening(
     listen: str, role: str, settings: Settings, deployment: Deployment, *, insecure: bool
 ) -> MakeLink:
-    """Return the function that creates a link over a local socket at the endpoint of `--listen`.
+    """Return a function that creates the link of a service. The link listens for the master at the endpoint `listen`.
 
     Raises:
-        SettingsError: `listen` is not an endpoint. Or other machines could reach the link or the metrics, and
-            `insecure` is False.
+        SettingsError: `listen` is not an endpoint. If `insecure` is False, the error is also raised if other machines
+            could reach the endpoint or the metrics.
     """
     check_metrics(settings.metrics, insecure=insecure)
     endpoint = endpoint_from(listen, "--listen")

@@ -159,7 +159,10 @@ class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class SilentProcess(msgspec.Struct, frozen=True):
-    """A process that did not report its status, although it has a status socket or the master waits for it."""
+    """A process whose status is unknown.
+
+    Either the process has a status socket without a usable answer, or the master waits for the process.
+    """
 
     name: str
     why: str

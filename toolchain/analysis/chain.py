@@ -156,7 +156,7 @@ class ExactChain:
         return np.asarray(np.linalg.inv(np.eye(len(self.law)) - self.sweep + self.law))
 
     def effective(self) -> NDArray[np.float64]:
-        """Return the number of independent samples equivalent to a sweep, for each searched value: float64[values]."""
+        """Return how many independent samples one sweep is worth, for each searched value: float64[values]."""
         places = np.arange(len(self.posterior(self.law)))
         values = (self._searched[:, np.newaxis] == places).astype(np.float64)
         centred = values - self.law @ values
@@ -192,7 +192,10 @@ class ChainError:
     worst_reading: tuple[int, ...]
     """The reading with the distance `worst`: one address per known variable."""
     start: float
-    """Mean distance of a frame's expected posterior from that of the stationary law: the start state's effect."""
+    """Mean distance between a frame's expected posterior and the stationary law's posterior.
+
+    The start state causes this distance.
+    """
     sampling: float
     """Mean distance of a frame's posterior from its expected value, because the samples are few and correlated."""
     cycles: float

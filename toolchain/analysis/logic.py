@@ -95,7 +95,10 @@ class Of(StrEnum):
     WORD = "word"
     """A word that the host writes for a frame, in bm1_words. Its logic decodes the address and checks the value."""
     MEMORY = "memory"
-    """A memory of the words that the host writes, in bm1_words. Its logic writes the words of a reset, and reads."""
+    """A memory of the words that the host writes, in bm1_words.
+
+    The logic of the memory writes the initial words after a reset, and reads words for the host.
+    """
     REPLICA = "replica"
     """A replica, if there are several. Its logic, in bm1_control and bm1_readout, handles stop, resume and outcome."""
 
@@ -176,7 +179,8 @@ def state_bits(p: BM1Parameters | BM2Parameters, table_length: int) -> int:
 def logic_of(parameters: BM1Parameters, *, table_length: int = LENGTH, inputs: int = 0) -> Logic:
     """Return the logic of a machine on a board, without memories. Raises a BuildError for ideal generators.
 
-    `inputs` is the number of all input words in the board's registers, if it is more than the machine needs.
+    `inputs` is the number of input words that the board's registers have. If `inputs` is smaller than the number of
+    input words that the machine needs, the needed number is used.
     """
     p = parameters
     if p.rng is RngKind.IDEAL:

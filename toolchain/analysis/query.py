@@ -172,12 +172,15 @@ def _machine_answer(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contents:
-    """The variables of a network, the searched variables, and the pairs that a BM1 cannot have as known variables."""
+    """The variables of a network, the searched variables, and the pairs that a BM1 cannot know together."""
 
     joint: JointDistribution
     searched: tuple[str, ...] = ()
     apart: Mapping[str, Sequence[str]]
-    """For each candidate for a known variable, the candidates that depend on it, given the searched variables."""
+    """For each candidate for a known variable, the candidates that a BM1 cannot know together with it.
+
+    A BM1 cannot know two candidates together if they depend on each other given the searched variables.
+    """
 
     def as_json(self) -> str:
         """Return the contents as one JSON object."""

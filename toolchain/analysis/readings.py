@@ -202,8 +202,8 @@ def recorded_readings(
 ) -> Readings:
     """Return at most `frames` readings of a recording (CSV, MCAP or bag), spread over its length.
 
-    With `in_sequence`, the readings come from the first rows. If a row does not fit the machine, the result then
-    contains it with all its readings missing.
+    With `in_sequence`, the readings come from the first `frames` rows. A row that does not fit the machine then counts
+    as a row without readings. Without `in_sequence`, a row that does not fit the machine is left out.
 
     `given` has NAME=COLUMN for each variable whose column has another name. A `*` in NAME and in COLUMN stands for
     equal text. In a bag with several topics, the messages of one row may be up to `tolerance_s` apart.

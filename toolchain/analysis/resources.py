@@ -73,8 +73,8 @@ def estimate(
 ) -> Estimate:
     """Return the resources of a machine on a device. Raises a BuildError if the machine exists only in emulation.
 
-    `inputs` is the number of all input words in the board's registers, if it is more than the machine needs. Results
-    take no memory, because they are counters.
+    `inputs` is the number of input words that the board's registers have. If `inputs` is smaller than the number of
+    input words that the machine needs, the needed number is used. Results take no memory, because they are counters.
     """
     return Estimate(
         device=device,

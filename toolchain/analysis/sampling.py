@@ -76,7 +76,8 @@ class Sampled:
         cycles: Cycles of the longest-running board.
         sweep_cycles: Mean cycles of a sweep, or 0 if samples are taken after every move.
         effective_samples: Median and minimum of the effective samples of a frame. Unknown numbers are 0.
-        r_hat: Median R-hat of a frame. One board has an R-hat of 0. An infinite R-hat is 1e9.
+        r_hat: Median R-hat of a frame. A frame without an R-hat, for example of a single board, counts as 0. An
+            infinite R-hat counts as 1e9.
         reasons: How often boards stopped for each reason. Boards stop with `impossible` if no state is possible.
     """
 

@@ -29,7 +29,10 @@ _MOST_CODES: Final = 1 << 30
 MACHINE_KEYS: Final = tuple(
     key for key in BM1Section.model_fields if key in BM1Parameters.__dataclass_fields__ and key != "lines"
 )
-"""Keys of `[machine]` that are fields of BM1Parameters. `lines` is missing: `[machine]` counts all boards' lines."""
+"""Keys of `[machine]` that are fields of BM1Parameters, except `lines`.
+
+`[machine]` counts the lines of all boards. The BM1Parameters of a board count only the lines of this board.
+"""
 
 
 def machine_options(source: BuildOptions | MachineSection, keys: Iterable[str]) -> dict[str, Any]:

@@ -36,7 +36,10 @@ class ColumnLoss:
     bits: int
     """Number of address bits."""
     values: int
-    """Number of addresses that stand for a value of the variable."""
+    """Number of values of the variable.
+
+    For `prior`, number of values of the variable that selects the prior, or 1 if no variable selects the prior.
+    """
     mass: float
     """Sum of P(S, K) over the cells with code 0: the probability that a reading selects code 0 on the true line."""
     kl_bits: float

@@ -225,9 +225,10 @@ def legal_states(machine: BM2Machine) -> NDArray[np.bool_]:
 def unconnected(
     machine: BM2Machine, legal: NDArray[np.bool_], known: Sequence[int]
 ) -> tuple[int, int] | None:
-    """Return two legal states that no moves through legal states connect, or None if there are none.
+    """Return two legal states without a path between them, or None if there are no such states.
 
-    Both states have equal values of the variables at the indices `known`.
+    Both states have equal values of the variables at the indices `known`. A path leads through legal states with the
+    same values of these variables, and changes one bit at a time.
     """
     p, index = machine.parameters, np.arange(len(legal))
     mask = sum(p.masks[variable] for variable in known)

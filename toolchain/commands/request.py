@@ -210,7 +210,11 @@ def build_options(
 
 
 def fit_to_device(plan: "MachinePlan", name: str | None) -> tuple["MachinePlan", str]:
-    """Return the plan with enough boards of the device, and the reasons. With `--replicas fill`, fill each board."""
+    """Return the plan with as many boards as the machine needs on the device `name`, and the reasons as text.
+
+    With `--replicas fill`, the plan also gets as many replicas as fit a board. If `name` is None, return the plan
+    unchanged and an empty text.
+    """
     if name is None:
         return plan, ""
     from toolchain.analysis.logic import device_named

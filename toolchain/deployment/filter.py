@@ -136,6 +136,6 @@ class Filter:
         return prediction_codes(self.belief, self._prob_bits)
 
     def update(self, posterior: NDArray[np.float64] | None) -> None:
-        """Make the posterior of the frame the belief. If `posterior` is None, the prediction remains the belief."""
+        """Set the belief to the posterior of the frame. If `posterior` is None, keep the prediction as the belief."""
         if posterior is not None:
             self.belief = posterior

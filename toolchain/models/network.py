@@ -1,7 +1,8 @@
 """The network that a BM2 samples: the relevant factors of a question and their symbols (thesis 2.1.3).
 
 Known symbols remain variables, because a reading may be missing. Each given symbol is fixed at its value in the tables.
-A symbol is left out if it cannot change the answer because its distribution sums to 1.
+A symbol that is not searched, known or given is left out if only its own distribution contains it. The distribution
+sums to 1, so the symbol cannot change the answer. The rule is applied until no such symbol is left.
 """
 
 import math

@@ -301,9 +301,10 @@ class Subscriptions:
     def receive_known(
         self, messages: Sequence[bytes], first: int, received_ns: int, monotonic_ns: int
     ) -> tuple[list[Message], tuple[int, ...]]:
-        """Decode messages from index `first` on that have one known envelope. Return them with subscription numbers.
+        """Decode messages from index `first` on, as long as they have the same known envelope.
 
-        Decoding stops at a message that has another envelope, is too large or is invalid. If no message is returned,
+        Return the decoded messages, and the numbers of the subscriptions to the topic of this envelope. Decoding stops
+        at the first message that has another envelope, is too large or is invalid. If no message is decoded,
         `ClientCore.receive` must handle the message at `first`.
         """
         envelope, size, topic, subscribed = self._known
