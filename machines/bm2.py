@@ -396,9 +396,10 @@ class BM2Start:
 
 
 def cde_table(factor: npt.NDArray[np.float64], prob_bits: int) -> npt.NDArray[np.uint16]:
-    """Return a CDE's table (`BM2Machine.tables`), from the odds factor(bit = 1) / factor(bit = 0) of each bit.
+    """Return the table of codes of a factor's CDE (`BM2Machine.tables`).
 
-    The factor is float64[cardinalities of the variables]. For n bits, the result is uint16[n * 2**(n - 1)].
+    The factor is float64[cardinalities of the variables]. For n bits, the result is uint16[n * 2**(n - 1)]. Each code
+    expresses the odds of one bit. The odds are the value of the factor for bit = 1, divided by its value for bit = 0.
 
     A variable's codes beyond its cardinality, up to the next power of two, are unused. If a bit decides between a
     used and an unused code, the odds favour the used code as far as a table can. If both codes are unused, the odds

@@ -70,7 +70,11 @@ class BM2Kind(MachineKind):
     }
 
     def due_sections(self, parameters: BM2Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-        """Yield the sections of a file: each CDE, each factor's non-zero entries, and any table of random numbers."""
+        """Yield the name, dtype and shape of each section that a programming file must have.
+
+        Each CDE has a section with its codes. Each factor has a section that marks its non-zero entries. If the
+        generators read a table of random numbers, this table is the last section.
+        """
         for at in range(parameters.cdes):
             bits = len(parameters.factor_bits(at))
             yield f"cde {at}", "<u2", (bits << bits >> 1,)

@@ -67,8 +67,8 @@ class Reassembler:
     def __init__(self, *, max_size: int = MAX_SIZE) -> None:
         """Start without fragments.
 
-        `max_size` is the maximum size of a complete message in bytes. All incomplete messages together may occupy
-        four times as many bytes, with `OVERHEAD` for each fragment.
+        `max_size` is the maximum size of a complete message in bytes. All incomplete messages together may occupy about
+        four times as many bytes. Each fragment counts with its size plus `OVERHEAD` bytes.
         """
         self.waiting_bytes = 0
         """Number of bytes that all incomplete messages occupy, with `OVERHEAD` for each fragment."""

@@ -84,8 +84,8 @@ class Caller:
     def operation(self, op: str, kind: str, **fields: object) -> bytes:
         """Return an operation for this client, as JSON.
 
-        `kind` is `service` or `action`. Under this key, the operation has the name that the client used for the service
-        or action.
+        `kind` is `service` or `action`. The operation's field `service` or `action` contains the name of the service or
+        action, spelled as in the client's request.
         """
         identity = {} if self.id is None else {"id": self.id}
         return orjson.dumps({"op": op, kind: self.name, **fields, **identity})

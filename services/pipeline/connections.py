@@ -67,7 +67,11 @@ async def connect_all(
 
 
 def reconnect_now(rosbridges: Mapping[str, Ros]) -> None:
-    """Retry all lost servers immediately. A service does this when the master reports that the other is connected."""
+    """Try immediately to reconnect to all lost servers.
+
+    When the subscriber is connected again, the master tells the publisher, which then calls this function. The
+    subscriber does the same when the publisher is connected again.
+    """
     for ros in rosbridges.values():
         ros.reconnect_now()
 

@@ -250,7 +250,8 @@ class Published(Record, tag="published", frozen=True):
 class Seen(Record, tag="seen", frozen=True):
     """With `--loop`, the publisher tells the master whether the server sent a published result back in time.
 
-    If it sent none back in time, a second `Seen` follows as soon as a later result comes back.
+    If no result comes back in time, the publisher sends `Seen(False)`. If a result comes back after that, the
+    publisher sends `Seen(True)`.
     """
 
     seen: bool

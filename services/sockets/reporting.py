@@ -30,7 +30,10 @@ from terminal.health import in_thread, resources, serve_health
 from terminal.one_line import one_line
 
 STUCK_S = 30.0
-"""Seconds without progress after which a process with one blocking thread counts as stuck."""
+"""A board counts as stuck after this many seconds without progress.
+
+A master counts as stuck if one of its child processes does not answer for this many seconds.
+"""
 _SAMPLE_EVERY = 1.0
 _SAMPLES = 6
 """Number of samples, one per second: a rate covers the last five seconds."""

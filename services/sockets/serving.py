@@ -74,7 +74,10 @@ class Link(Protocol):
 
 
 MakeLink = Callable[[Callable[[AnyRecord], None]], Link]
-"""Function that creates a service's link. Its argument is called with each record after a master's hello."""
+"""Function that creates a service's link.
+
+The argument is a callback of the service. The link passes every record from the master to this callback, except hellos.
+"""
 
 
 class MasterLink(Link):

@@ -75,7 +75,10 @@ class Of(StrEnum):
     """The units in which a machine's logic is counted. The text of each unit names the VHDL that contains it."""
 
     BOARD = "board"
-    """The units of which a board has one: bm1_axi, bm_register_block, bm1_guard, and bm1_control for one machine."""
+    """The units that every board has once: bm1_axi, bm_register_block, bm1_guard, and bm1_control.
+
+    bm1_control is counted here as on a board without replicas. `REPLICA` counts the logic that replicas add.
+    """
     CODE_BIT = "code bit"
     """A bit of a cell's code, in bm1_stochastic_bitstream_generator.
 
@@ -91,7 +94,10 @@ class Of(StrEnum):
     STEP = "step"
     """A step of an LFSR in a cycle, in bm1_lfsr. Its logic computes the parity of the taps."""
     PLACE_BIT = "place bit"
-    """A bit of the index in a table of random numbers, in bm1_table_player. Its logic computes the next index."""
+    """A bit of the index with which bm1_table_player reads a table of random numbers.
+
+    The logic of the bit computes this bit of the next index.
+    """
     WORD = "word"
     """A word that the host writes for a frame, in bm1_words. Its logic decodes the address and checks the value."""
     MEMORY = "memory"

@@ -171,7 +171,10 @@ class PartFile:
         self.there[row] = 1
 
     def earlier(self, row: int) -> tuple[_Posterior, int] | None:
-        """Return a row's posterior, if there is any, and cycles. Return None if the file lacks the row's record."""
+        """Return the posterior and the cycles of a row, or None if the file lacks the row's record.
+
+        The posterior is None if the frame of the row had no posterior.
+        """
         if not self.there[row]:
             return None
         posterior: NDArray[np.float64] = np.array(self.records[row]["posterior"])

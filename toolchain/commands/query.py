@@ -64,7 +64,9 @@ def show(
     ] = "",
     json: Json = False,
 ) -> None:
-    """List the variables and states of a network and, with --searched, the variables that a BM1 can know together.
+    """List the variables and states of a network.
+
+    With --searched, also show which variables can be known variables of the same BM1.
 
     For example `toolchain show asia.bif --searched bronc`
     """

@@ -1,8 +1,8 @@
 """Joint distributions as in the library ProBT, made of symbols and factors.
 
-A factor is a table, a normal distribution, a function or a potential. Continuous distributions become tables. For a
-normal distribution, an entry of the table is the integral over the interval of a value of the symbol. For a function,
-an entry is the value of the function.
+A factor is a table, a normal distribution, a function or a potential. Every factor becomes a table. For a normal
+distribution, each value of the symbol stands for an interval. The entry of the value is the integral of the normal
+distribution over this interval. For a function, the entry of the function's value is 1, and all other entries are 0.
 """
 
 import math

@@ -74,7 +74,7 @@ def test_lost_frames_are_said_by_build_check_and_inspect(case):
     report = build(case, "--max-cycles", 1000).stdout
     (warning,) = [row for row in report.splitlines() if "get no posterior" in row]
     assert warning.startswith("Warning: ")
-    assert "% expected)" in warning
+    assert "(then " in warning
     rows = look(case.parent / "out", "--model", case, "--banks", 1).stdout.splitlines()
     every, alone = (
         float(row.split()[5]) for row in rows if row.startswith("  the machine against the model")
