@@ -59,8 +59,8 @@ class Field:
             True if the message has the variable, and its unchanged value. The value of a missing variable is None.
 
         Raises:
-            FieldAmbiguousError: Several fields of the message have the variable's bare name, and the name was in no
-                earlier message.
+            FieldAmbiguousError: The place of a bare name is not known from an earlier message, and several fields of
+                this message have the name.
         """
         # A bare name is searched until it is found, and then has the same place in all messages.
         place = self.place

@@ -29,7 +29,10 @@ STATE_BITS_MAX: Final = 2048
 """Maximum number of bits of the state. The register map has 64 words for a state."""
 
 FACTOR_BITS_MAX: Final = 20
-"""Maximum total number of bits of a factor's variables. A factor of 20 bits has 20 * 2**19 codes, or 20 MB."""
+"""Maximum total number of bits of a factor's variables.
+
+Each bit has a code for every combination of the other bits. A factor of 20 bits has 20 * 2**19 codes, or 20 MiB.
+"""
 
 RESULT_WORDS_MAX: Final = 4096
 """Maximum number of words of all histograms, including the joint histogram. RESULTS has this size."""

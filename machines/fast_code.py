@@ -403,8 +403,8 @@ def begin(
 ) -> int:
     """Select the lines of every replica, run the first slice of every replica, and fill in `frame.outcome`.
 
-    Returns the number of assigned rows. All rows are assigned before the first block is run. A row therefore
-    means the same code in all replicas. A replica in which no line can count runs no cycle.
+    Returns the number of rows of the store that have a code. Every row gets its code before the first block is run, so
+    a row has the same code in all replicas. A replica in which no line can count runs no cycle.
     """
     rows = _NO_ROWS
     for replica in range(codes.shape[0]):

@@ -86,7 +86,7 @@ def encode(
 
 
 class FrameDecoder:
-    """Decoder of a stream of bytes into frames, with one buffer as long as the link is open.
+    """Decoder of a stream of bytes into frames. It uses the same buffer until the link is closed.
 
     Receive bytes into `room`, and pass their number to `received`. Then call `next_frame` until it returns None.
     After an error, the decoder is unusable.

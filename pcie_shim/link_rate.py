@@ -28,7 +28,10 @@ def wait_until(tick_ns: int) -> None:
 
 
 class LinkModel:
-    """A simulated wire to a board. All boards whose processes are forked after its creation share a shared wire."""
+    """A simulated wire to one board, or to several boards.
+
+    If `wire.shared` is set, all board processes that are forked from this process later use the same wire.
+    """
 
     def __init__(self, wire: LinkFigures, wait: Callable[[int], None] = wait_until) -> None:
         self._wire = wire

@@ -25,7 +25,10 @@ class EmulatedPosterior(Posterior):
 
     deployment: Deployment = field(compare=False)
     machines: tuple[Any, ...] = field(compare=False)
-    """The emulated machines of the boards. `exact` uses them, because the deployment's folder may change."""
+    """The emulated machines of the boards. The method `exact` uses these machines.
+
+    The method does not load the deployment's folder again, because the folder may have changed.
+    """
     addresses: tuple[int | None, ...]
     """One address for each variable, in the order of the deployment. None stands for a missing reading."""
 

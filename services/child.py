@@ -120,7 +120,10 @@ class Child:
         directory: LockedRunDirectory | None = None,
         ends: deque[float] | None = None,
     ) -> None:
-        """Store the command. `ends` keeps the last exit times (`RESTARTS` + 1 by default). Children may share it."""
+        """Store the command. `ends` holds the times of the last exits, and several children may share one `ends`.
+
+        If `ends` is None, the child keeps the times of its last `RESTARTS` + 1 exits.
+        """
         self.name = name
         self._command = command
         # The run directory, whose lock the child holds too, so that the next run waits for its end.

@@ -61,7 +61,7 @@ class Job(Protocol):
 
 
 Run: TypeAlias = Callable[[Job, Sequence[int], Keep], None]
-"""A function that does the pieces with these numbers, and passes each result to `keep` as soon as it has the result."""
+"""A function that does the numbered pieces of a job, and passes each result to `keep` as soon as it has the result."""
 
 
 def in_this_process(job: Job, numbers: Sequence[int], keep: Keep) -> None:

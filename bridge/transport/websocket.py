@@ -228,7 +228,10 @@ class WebSocketTransport(asyncio.Protocol):
         self._transport.set_write_buffer_limits(high=self._write_limit)
 
     def data_received(self, data: bytes) -> None:
-        """Handle bytes from the socket: messages of one frame here, and all other frames by the websockets library."""
+        """Handle bytes from the socket.
+
+        A message in a single frame is decoded directly. The websockets library decodes all other frames.
+        """
         self.last_heard = time.monotonic()
         at = 0
         if self._rest:

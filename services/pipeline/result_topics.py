@@ -95,9 +95,10 @@ class ResultTopics:
             yield f"publishing on {topics} at {', '.join(by_uri)}"
 
     def served_by(self, uri: str) -> tuple[str, str]:
-        """Return two parts of a sentence about a server, such as ` for /BMresults` and `rosbridge at ws://robot:9090`.
+        """Return the output topics of a server and the name of the server, as parts of a sentence for the user.
 
-        With a single server, the parts are an empty text and `rosbridge`.
+        An example is ` for /BMresults` and `rosbridge at ws://robot:9090`. If the stack uses a single server, the
+        parts are an empty text and `rosbridge`.
         """
         if len(self.rosbridges) == 1:
             return "", "rosbridge"

@@ -78,13 +78,15 @@ class Synchroniser(Generic[Item]):
 
     Every other topic adds its message nearest to the pivot. All messages of a set must be within the tolerance of the
     pivot. A message of a topic that is not needed must also be nearer to this pivot than to the next message of the
-    pivot's topic. A set waits at most the tolerance for nearer messages of topics that are alive. Each message is used
-    once.
+    pivot's topic. Each message is used once.
+
+    If a topic is alive and may still send a message nearer to the pivot, the set waits for this message. The wait is
+    at most as long as the tolerance.
 
     Attributes:
         unpaired: Number of messages that were dropped without a set.
         deadline: Tick at which `take_set` must be called again, or None.
-        absent: Indices of the topics that were alive but are not in the last set.
+        absent: Indices of the topics that have no message in the last set, although the set waited for one.
     """
 
     def __init__(self, needed: Sequence[bool], tolerance_ns: int) -> None:

@@ -34,9 +34,10 @@ _WORK: Final = 2**27
 def agreement(
     machine: BM2Machine, bit: int, values: Mapping[int, NDArray[np.int64]]
 ) -> list[tuple[int, NDArray[np.float64]]]:
-    """Return each CDE whose factor contains a bit, and the CDE's chance of drawing 1 in each state, float64[states].
+    """Return an item for each CDE whose factor contains a bit.
 
-    `values` maps every other bit of these factors to the bit's value in each state, int64[states].
+    An item is the index of the CDE, and the CDE's probability of drawing 1 in each state, float64[states]. `values`
+    maps each other bit of these factors to the value of that bit in each state, int64[states].
     """
     p, found = machine.parameters, []
     variable = next(at for at, mask in enumerate(p.masks) if mask >> bit & 1)

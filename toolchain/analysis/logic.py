@@ -315,7 +315,10 @@ def random_memories_of(p: BM1Parameters | BM2Parameters, table_length: int) -> l
 
 
 def word_memories_of(p: BM1Parameters, inputs: int = 0) -> list[EqualMemories]:
-    """Return the memories of the words that the host writes (bm1_words). A written prior adds one for initial codes."""
+    """Return the memories of the words that the host writes (bm1_words).
+
+    If the host writes the prior, there is one more memory, with the codes of the initial prior.
+    """
     used = BM1.registers(p)
     depths = [max(inputs, used.input_words, 1)]
     initial = []

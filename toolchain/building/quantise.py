@@ -45,8 +45,9 @@ class ColumnLoss:
     kl_bits: float
     """KL(Q(S | k) || P(S | k)) in bits, averaged over the reading k of this column.
 
-    P is the exact posterior from the column alone, and Q is the posterior from the column's codes. In both, every line
-    has the reading k. KL(P || Q) would be infinite if a line with a small probability gets the code 0.
+    P is the exact posterior for the reading k of this column alone. Q is the posterior for the same reading, from the
+    column's codes. If each line has its own reading (`sensor_mode = cell`), k is the reading of every line. KL(P || Q)
+    would be infinite if a line with a small probability gets the code 0.
     """
     dead_values: int
     """Number of values that have a probability above 0, but code 0 on every line."""

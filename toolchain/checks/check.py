@@ -90,7 +90,7 @@ def check_deployment(directory: Path) -> list[Finding]:
 
 
 def refusal(reason: Exception, about: str) -> Finding:
-    """Return the finding that a part of a model or a deployment, `about`, cannot be built or read for this reason."""
+    """Return the finding that `about` cannot be built or read. `about` names a part of a model or a deployment."""
     return error(Check.CANNOT_BE_BUILT, about, str(reason).rstrip("."))
 
 

@@ -16,7 +16,7 @@ from toolchain.errors import BuildError, NotFusionError, counted
 from toolchain.flags import Bits
 
 RESULTS = Path("build/explore.jsonl")
-"""The default file of results. Version control ignores the folder `build`, and most deployments are built there."""
+"""The default file of results. It is in `build`, because Git ignores this folder."""
 
 
 @contextmanager

@@ -220,8 +220,8 @@ class Variable(Section):
     """`[[variable]]`: a known variable, and the conversion of its readings to addresses.
 
     A variable of kind `sensor` is a column of the machine. A variable of kind `prior_select` selects the row
-    of the prior's table (thesis 2.1.2). A missing reading selects the table's last row (the top
-    address), the prior without a selection.
+    of the prior's table (thesis 2.1.2). If the reading of `prior_select` is missing, the last row of the
+    prior's table applies. The last row is the prior that depends on no reading.
     """
 
     name: Name
@@ -440,7 +440,7 @@ class Output(Section):
 
 
 class TopicsSection(Section):
-    """`[topics]`: whether to publish each topic for robot tools; with None, if it fits the searched variables."""
+    """`[topics]`: whether to publish each topic for robot tools. None stands for the topic's default."""
 
     counts: bool | None = None
     posterior: bool | None = None

@@ -100,7 +100,10 @@ def _mass(
 
 
 def middle_bin(bin_in_sigmas: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return a normal's probability of a bin centred at the mean. `bin_in_sigmas` is the bin's width over sigma."""
+    """Return the probability of the bin whose centre is the mean of a normal distribution.
+
+    `bin_in_sigmas` is the width of the bin divided by sigma.
+    """
     return 1 - 2 * _upper_tail(bin_in_sigmas / 2)
 
 

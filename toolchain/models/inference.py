@@ -287,7 +287,11 @@ class Links:
 
 
 def relevant(factors: Iterable[Factor], asked: set[str]) -> list[Factor]:
-    """Return the factors without distributions that sum to 1: their symbols are not in `asked` or in other factors."""
+    """Return the factors that a result over the symbols `asked` needs.
+
+    A distribution P(A | ...) is left out if A is neither in `asked` nor in another remaining factor. Summing out A
+    then only multiplies by 1.
+    """
     kept = list(factors)
     uses: dict[str, int] = {}
     own: dict[str, int] = {}

@@ -125,7 +125,7 @@ class Known(TabulatedVariable):
     floor: float = 0.0
     """Lower bound of the table's probabilities, as a fraction of the likelihood's peak; 0 means no bound.
 
-    Quantising warns if the codes cannot express the minimum.
+    Quantising warns if the bound is so low that a probability gets the code 0.
     """
     normal: Normal | None = field(default=None, repr=False)
     """The normal distributions from which the table was computed, or None."""
