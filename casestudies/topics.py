@@ -93,7 +93,7 @@ def run_viewer(watching: Coroutine[Any, Any, None], finish: Callable[[], None]) 
 
 
 SETTLED_S: Final = 3.0
-"""Seconds after which a server that does not list an advertised topic is known to have refused the topic."""
+"""Seconds from an advertisement until the server must list the topic or service. Otherwise, the server refused it."""
 
 
 async def report_refused(

@@ -48,7 +48,10 @@ def make_bm2_kernel(machine: "BM2Machine") -> "BM2Kernel":
 
 
 def warm_up() -> None:
-    """Load the fast kernels before the first frame; the first call compiles them. Forked processes share them."""
+    """Load the fast kernels before the first frame, or compile them if Numba's cache on disk does not have them.
+
+    Processes that are forked afterwards inherit the loaded kernels.
+    """
     from machines import bm2_fast, fast
 
     fast.warm_up()

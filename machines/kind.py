@@ -131,7 +131,8 @@ class UsedRegisters:
         inputs: Name of the block of inputs.
         input_words: Number of input words of all replicas.
         result_words: Number of words of the block RESULTS, for all replicas.
-        written: For the name of each other block that a host may write, the number of words.
+        written: The number of words of each block that a host may write, by the block's name. The block of inputs is
+            not included.
         answer: For the name of each block that a stopped board sends, the number of words. The blocks are in the
             order of sending, and RESULTS is the first.
         capabilities: Values of capability registers (`CAP_LINES`) or of their fields (`CAP_MACHINE.KIND`), by name.

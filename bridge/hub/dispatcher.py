@@ -23,7 +23,7 @@ class Dispatcher:
     """Output to all clients of one hub."""
 
     def __init__(self, limits: HubLimits) -> None:
-        """Start without output."""
+        """Create a dispatcher that has no output for any client yet. `limits` are the limits of the hub."""
         self._limits = limits
         # The clients with output, each once (`Client.is_ready`), until the owner of the sockets takes them.
         self._ready: list[Client] = []

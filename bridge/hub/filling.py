@@ -45,8 +45,9 @@ class Filler:
 
         Args:
             defaults: The default of each field. The defaults must not be changed.
-            varying: Functions that compute a default from the message, by field. Such fields are stamps, and the
-                fields of a time with the names of the other ROS version.
+            varying: Functions that compute the defaults that are not constant, by field. The default of a stamp or a
+                header contains the time of receipt. The default of a field of a time (such as `secs`) is the field of
+                the other ROS version (such as `sec`) in the same message.
             parts: The fields that contain a message or an array of messages, each with its filler.
             is_time: Whether the type is a time or a duration.
         """

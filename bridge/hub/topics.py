@@ -117,11 +117,12 @@ class Topics:
             self.distribute(topic, parsed, now)
 
     def publish_known(self, client: Client, messages: Sequence[bytes], first: int, now: float) -> int:
-        """Perform `publish` operations that begin with a known envelope, and parse only the bytes after the envelope.
+        """Perform `publish` operations without parsing their envelopes, the bytes before the value of `msg`.
 
-        `messages` may contain any operations, and `first` is the index of the first operation to perform. Return the
-        index of the first operation that was not performed, or `len(messages)` if all were performed. An operation is
-        not performed if it must be parsed in full, or if the client's turn is over.
+        The hub knows an envelope from an earlier operation of the client. `messages` may contain any operations, and
+        `first` is the index of the first operation to perform. The method stops at an operation that must be parsed
+        in full, or when the client's turn is over. Return the index of the first operation that was not performed, or
+        `len(messages)` if all were performed.
         """
         advertisement = client.last_published
         while advertisement is not None and first < len(messages) and self._dispatcher.work <= TURN_WORK:

@@ -327,7 +327,10 @@ class WebSocketTransport(asyncio.Protocol):
             self.proceed()
 
     def proceed(self) -> None:
-        """If reading is not blocked, continue an interrupted turn as soon as other tasks have had a turn."""
+        """Schedule the handling of the bytes left over from an interrupted turn. Other tasks run first.
+
+        Nothing is scheduled while reading is blocked.
+        """
         if self._interrupted is not None and not self._is_scheduled and not self.is_blocked:
             self._is_scheduled = True
             asyncio.get_running_loop().call_soon(self._proceed)

@@ -268,7 +268,10 @@ class RunService(ABC):
 
 
 async def report_failure(link: Link, error: BaseException) -> None:
-    """Send the master the error that ends this service. A bug is not sent, because the service prints the bug."""
+    """Send the master the error that ends this service.
+
+    An error that indicates a bug is not sent, because the service prints it.
+    """
     code = exit_code_of(error)
     if code == ExitCode.BUG or not isinstance(error, Exception):
         return

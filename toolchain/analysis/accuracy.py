@@ -95,7 +95,8 @@ class ZScores:
         counts: Number of z-scores.
         draws: Number of independent sequences of random numbers. There is one per bank of seeds, or one per reading if
             generators are never reset. The intervals are bootstrapped over these sequences.
-        rms: Root mean square of the z-scores. It is 1 for independent bits, and 1.6 for 2.6 times their variance.
+        rms: Root mean square of the z-scores. It is 1 for independent bits. If the variance of the counts is v times
+            that of independent bits, the root mean square is sqrt(v).
         mean: Mean of the z-scores. It is 0 if the counts are unbiased.
         beyond_three: Share of z-scores below -3 or above 3. It is 0.0027 for a normal distribution.
     """

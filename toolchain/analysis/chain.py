@@ -5,7 +5,7 @@ move, each CDE whose factor contains the bit draws 0 or 1. The bit is written wh
 numbers are ideal, the probability that all CDEs draw 1 is the product of their probabilities of a 1. The probability
 that all draw 0 is the product of the complements. These products give the transition matrix of a sweep. The matrix
 gives all values that long runs approach. The codes are those of the machine, so the effects of quantising and clipping
-are included. A sample is the state after a sweep, even if the machine takes a sample after every move.
+are included. If the machine takes a sample after every move, the analysis still uses only one sample per sweep.
 """
 
 import itertools
@@ -198,7 +198,10 @@ class ChainError:
     The start state causes this distance.
     """
     sampling: float
-    """Mean distance of a frame's posterior from its expected value, because the samples are few and correlated."""
+    """Mean distance of a frame's posterior from the frame's expected posterior: the effect of random sampling.
+
+    More samples reduce the distance. Correlation of the samples increases it.
+    """
     cycles: float
     """Mean cycles of a sweep."""
     effective: float

@@ -151,8 +151,9 @@ def model_of_codes(
 ) -> Model:
     """Reconstruct a model from the codes of a machine, for drawing readings without the original model.
 
-    Before quantising, each row of a table was divided by the row's maximum. Expectation maximisation estimates the
-    maxima of the rows, so that the column of every line sums to 1 as nearly as possible.
+    A table has a row for each value of a reading, and a probability for each line in the row. The build divided each
+    row by the row's maximum, so the codes do not contain the maxima. Expectation maximisation estimates the maxima. It
+    uses the fact that the probabilities of all values sum to 1 for every line.
     """
     width = machine.parameters.prob_bits
     known = []

@@ -174,11 +174,14 @@ class Relation:
 
 
 def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> tuple[list[Relation], int]:
-    """Search groups of columns for relations of 2, 3 or 4 bits, as many groups as a few seconds permit.
+    """Search groups of columns for 2, 3 or 4 random bits whose XOR is 0 in every cycle. Such bits are a `Relation`.
 
-    The machine ANDs the bits of the columns in a group. `seeds` are uint64[groups, columns]. The random number that is
-    compared with a code is the low `prob_bits` bits of a state. Returns one relation with the fewest bits for each
-    group that has relations, and the number of searched groups.
+    `seeds` are uint64[groups, columns]. The machine ANDs the bits of the columns in a group. The random number that is
+    compared with a code is the low `prob_bits` bits of a generator's state. To limit the time to a few seconds, the
+    search may stop before the last group.
+
+    Returns:
+        One relation for each group that has relations, with the fewest bits, and the number of searched groups.
     """
     groups, columns = seeds.shape
     bits = columns * prob_bits

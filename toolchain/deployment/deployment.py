@@ -162,7 +162,10 @@ class Deployment(DeploymentFile):
 
     @property
     def state_dimensions(self) -> tuple[Dimension, ...]:
-        """The variables of a BM2's sampled state, in the order of the state's bits, or () if one is not described."""
+        """The variables of a BM2's sampled state, in the order of the state's bits.
+
+        If the deployment does not describe one of these variables, the result is ().
+        """
         keys = {"offset", "step", "unit", "states"}
         known = (Dimension(label=v.name, size=v.values, **v.model_dump(include=keys)) for v in self.variables)
         described = {each.label: each for each in (*known, *self.searched, *self.hidden)}

@@ -238,7 +238,7 @@ def _short(word: str) -> str:
 
 
 LENGTH: Final = 1 << 16
-"""Length of the table from `random_table`. It is a multiple of the number of codes at every width of codes."""
+"""Length of the table from `random_table`. For every permitted `prob_bits`, it is a multiple of 2**prob_bits."""
 
 
 def table_length(machine: BM1Machine | BM2Machine) -> int:

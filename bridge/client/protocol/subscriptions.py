@@ -348,7 +348,10 @@ class Subscriptions:
         return known.subscribed.measure(known.topic, len(data)) if known is not None and is_usable else None
 
     def forget_envelopes(self) -> None:
-        """Forget the known envelopes of messages, because subscriptions or the server have changed."""
+        """Forget all known envelopes, so that the next message of each topic is decoded in full.
+
+        Call this method after a change of the subscriptions or of the server.
+        """
         self.envelopes.clear()
         self._known = _UNKNOWN
         for subscribed in self._subscribed.values():
