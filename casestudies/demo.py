@@ -73,9 +73,9 @@ def boat(rates: Sequence[str], clock: float, *, array: bool) -> Case:
 
 
 def sprinkler(rates: Sequence[str], count: int) -> Case:
-    """Return the sprinkler on two chains.
+    """Return the sprinkler on two boards, with one chain each.
 
-    Each of at most 256 frames has its own bank of seeds, so no frame repeats the random numbers of another frame.
+    In a run of at most 256 frames, each frame has its own bank of seeds, so no two frames use the same random numbers.
     """
     options = {"machine": "bm2", "samples": 50_000, "stream": 4096, "rng-banks": min(max(count, 16), 256)}
     return Case(

@@ -106,7 +106,7 @@ class FastBM1(BM1Kernel):
 
     @property
     def kept_cycles(self) -> int:
-        """Number of cycles, counted from the start of a frame, for which the cache has room in each bank."""
+        """Number of cycles at the start of a frame for which the cache has room, for each bank of seeds."""
         return 0 if self._of_frame else self._kept_blocks * BLOCK_CYCLES
 
     def prepare(self) -> None:

@@ -92,7 +92,7 @@ class BoardResult(msgspec.Struct, frozen=True, array_like=True, tag="board"):
 
 
 class Inference(NamedTuple):
-    """The posterior for the results of all boards.
+    """The posterior computed from the results of all boards.
 
     Attributes:
         boards: The boards' results.
@@ -312,7 +312,10 @@ class MachineKind(ABC):
 
     @abstractmethod
     def infer(self, results: Sequence[BoardResult], variables: Sequence[str] = ()) -> Inference:
-        """Return the posterior for the results of all boards. Messages use the variables' names in `variables`."""
+        """Return the posterior for the results of all boards.
+
+        `variables` are the variables' names, for the text that says why a board was left out.
+        """
 
     @abstractmethod
     def posterior(

@@ -61,7 +61,7 @@ class VariableReading(NamedTuple):
     address: int
     """Address in the variable's column."""
     age_ms: FiniteFloat
-    """Milliseconds since the receipt of the variable's message, when the report is sent."""
+    """Milliseconds from the receipt of the variable's message until the report is sent."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -59,7 +59,7 @@ class Posterior:
     details: Mapping[str, str] = field(default_factory=dict)
     """Statistics of a BM2's samples, by their keys in `/bm/frame`; empty for a BM1."""
     dimensions: "tuple[Dimension, ...]" = ()
-    """Units and names of states for each label. Empty if the deployment is not known; see `with_units`."""
+    """For each label, its unit and the names of its states. Empty if the deployment is not known; see `with_units`."""
 
     @cached_property
     def values(self) -> "NDArray[np.float64]":

@@ -20,7 +20,7 @@ def new_figure(width: float, height: float) -> Any:
 
 
 def save_figure(figure: Any, path: Path, *, dpi: int = 130) -> None:
-    """Write a figure, or raise an OutputError. A PNG omits matplotlib's version, and changes only with the drawing."""
+    """Write a figure, or raise an OutputError. A PNG does not contain matplotlib's version."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         figure.savefig(path, dpi=dpi, metadata={"Software": None} if path.suffix == ".png" else None)

@@ -73,7 +73,7 @@ def in_this_process(job: Job, numbers: Sequence[int], keep: Keep) -> None:
 
 
 def in_order(run: Run, job: Job, numbers: Sequence[int], advance: Callable[[], None]) -> list[Any]:
-    """Do the pieces with these numbers, and call `advance` after each piece.
+    """Do the numbered pieces of a job with `run`, and call `advance` after each piece.
 
     The results are returned in the order of `numbers`, because sums of floats depend on the order.
     """

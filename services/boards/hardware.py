@@ -61,7 +61,7 @@ class SimulatedHardware:
     def board(self, index: int) -> RtlBoard:
         """Return a blank board, or raise a SimulationError.
 
-        If the board's image is known, the simulation of the image already runs.
+        If the image that the board will get is known, the simulation of the image starts before the image is loaded.
         """
         from pcie_shim.board.rtl_board import RtlBoard
 

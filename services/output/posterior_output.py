@@ -138,8 +138,8 @@ def drawing() -> Iterator[Show]:
 def picture(posterior: Posterior, axes: list[Axis], *, width: int, colour: bool, rows: int = ROWS) -> Text:
     """Draw a posterior with at most `width` columns and `rows` lines, plus text.
 
-    Without colour, characters show the probabilities. Of three or more dimensions, the two longest are drawn, and the
-    others are summed out.
+    Without colour, characters show the probabilities. If there are more than two dimensions, the two longest are
+    drawn, and the others are summed out.
     """
     # the words around the picture stay on the screen
     width, rows = min(width, WIDTH), max(min(rows, ROWS), 2)

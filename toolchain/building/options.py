@@ -248,7 +248,7 @@ def given_flags(options: CommonOptions, group: type[BM1Options | BM2Options]) ->
 
 @dataclass(frozen=True, kw_only=True)
 class MachineOptions(BM2Options, BM1Options, CommonOptions):
-    """All flags of a build about the machine. Flags that name a file or need parsing are not included."""
+    """All flags of a build that describe the machine, except flags that name a file or need parsing."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Findings of checks, and the checks of a BM1's codes for lines that never count and readings without a posterior."""
+"""Findings of checks. The checks in this module search the codes of a BM1, for example for lines that never count."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

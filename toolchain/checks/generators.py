@@ -167,9 +167,10 @@ _MOST_PAIRS: Final = 20_000_000
 
 @dataclass(frozen=True, slots=True)
 class Relation:
-    """Bits that XOR to 0 in every cycle. Their group is a bank or, with a generator per cell, a line of a bank."""
+    """Bits whose XOR is 0 in every cycle."""
 
     group: int
+    """Index of the bank of seeds. With a generator per cell, bank * lines + line."""
     bits: tuple[Bit, ...]
 
 

@@ -271,7 +271,7 @@ class Subscriptions:
         return bool(waiting)
 
     def silent(self) -> list[str]:
-        """Of the subscriptions that name a type, return the topics that are without a message on this connection."""
+        """Return the topics that are subscribed to by type and have sent no message on this connection."""
         return [
             s.topic
             for s in self._subscribed.values()
