@@ -73,7 +73,7 @@ def boat(rates: Sequence[str], clock: float, *, array: bool) -> Case:
 
 
 def sprinkler(rates: Sequence[str], count: int) -> Case:
-    """Return the sprinkler on two boards, with one chain each.
+    """Return the sprinkler on a BM2 of two boards, with one chain each.
 
     In a run of at most 256 frames, each frame has its own bank of seeds, so no two frames use the same random numbers.
     """

@@ -137,7 +137,10 @@ class BM2Kind(MachineKind):
         return make_bm2_kernel(machine)
 
     def on_board(self, kernel: BM2Kernel, memory: Mapping[str, memoryview]) -> BoardMachine:
-        """Return a board's machine that runs the kernel. Its inputs and results are in the board's blocks, `memory`."""
+        """Return a board's machine that runs the kernel.
+
+        `memory` is the board's blocks of registers by name, with the machine's inputs and results.
+        """
         return _OnBoard(kernel, memory)
 
     def on_host(self, machines: Sequence[BM2Machine]) -> HostMachine:

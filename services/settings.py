@@ -111,7 +111,9 @@ class Settings(BaseModel):
     board_timeout: Seconds = Field(
         default=5, description="Seconds that a board may take beyond the time for max_cycles at its speed."
     )
-    seen_timeout: Seconds = Field(default=2, description="Seconds until a result must be seen on the wire.")
+    seen_timeout: Seconds = Field(
+        default=2, description="Seconds until the rosbridge server must send a published result back."
+    )
     stop_timeout: Seconds = Field(
         default=5, description="Seconds in which processes must exit after SIGTERM."
     )

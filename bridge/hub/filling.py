@@ -45,9 +45,9 @@ class Filler:
 
         Args:
             defaults: The default of each field. The defaults must not be changed.
-            varying: Functions that compute the defaults that are not constant, by field. The default of a stamp or a
-                header contains the time of receipt. The default of a field of a time (such as `secs`) is the field of
-                the other ROS version (such as `sec`) in the same message.
+            varying: Functions that compute the defaults that are not constant, by field. A stamp or a header gets the
+                time of receipt. In a time, an absent `secs` gets the value of `sec` in the same message. The other
+                fields in which ROS 1 and ROS 2 differ are filled in the same way.
             parts: The fields that contain a message or an array of messages, each with its filler.
             is_time: Whether the type is a time or a duration.
         """
@@ -75,8 +75,8 @@ class Filler:
         Args:
             message: The message.
             room: Number of bytes by which the nested messages may grow.
-            keep: Whether the caller still needs `message`. If not, its own absent fields are added to it only if a
-                nested message has grown. This saves about a tenth of the time for a small message.
+            keep: If true, the absent fields are also added to `message`. If false, they are only returned, which saves
+                about a tenth of the time for a small message. If None is returned, they are added in both cases.
 
         Returns:
             The absent fields as JSON, followed by two closing braces. The caller replaces the last two braces of the

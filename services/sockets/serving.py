@@ -242,7 +242,7 @@ class RunService(ABC):
         """Serve until cancelled, or until an error. Unless the error is a bug, the service reports it to the master.
 
         Raises:
-            OutdatedError: A master requires the folder's present deployment, but this service loaded an earlier one.
+            OutdatedError: The deployment was rebuilt after this service loaded it, and a master requires the new one.
         """
         settings = self._settings
         status = serve_status(settings.run_directory, self.role, self.status, metrics=settings.metrics)

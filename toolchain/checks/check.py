@@ -213,7 +213,7 @@ _LEAST_TOLERANCE_S: Final = 0.005
 
 
 def source_findings(deployment: Deployment) -> Iterator[Finding]:
-    """Find topics whose messages have no header. The messages are paired with other topics by time of receipt."""
+    """Find topics without a header, if there are several: their messages are paired by the time of receipt."""
     if len(deployment.sources) < 2:
         return
     bare = [source.topic for source in deployment.sources if not _may_have_header(source.type)]
