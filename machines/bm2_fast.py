@@ -284,7 +284,10 @@ _NUMBERS: Final = ir.VectorType(ir.IntType(16), CHUNK)
 
 
 def compared(builder: Any, numbers: Any, place: Any, code: Any) -> Any:
-    """Build code that compares a chunk's random numbers with a code. Bit i is 1 if `numbers[place + i] < code`."""
+    """Build the LLVM instructions that compare `CHUNK` random numbers with a probability code.
+
+    Bit i of the result is 1 if `numbers[place + i] < code`.
+    """
     chunk = builder.load(builder.bitcast(builder.gep(numbers, [place]), _NUMBERS.as_pointer()))
     chunk.align = 2
     less = builder.icmp_unsigned("<", chunk, repeated(builder, code, _NUMBERS))

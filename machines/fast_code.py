@@ -84,7 +84,10 @@ def store_of_codes(occurring: npt.NDArray[np.bool_], slots: int) -> _Store:
 
 
 def store_of_frame(occurring: npt.NDArray[np.bool_], cells: int, slots: int) -> _Store:
-    """Allocate a store with a row for each code of a frame, at most one per cell. Each frame assigns the rows again."""
+    """Allocate a store for the codes of one frame. Each frame assigns the rows of the store to its own codes.
+
+    The number of rows is the number of codes that may occur, but at most the number of cells.
+    """
     none = np.zeros(min(int(occurring.sum()), cells), dtype=np.int64)
     return _store(np.full(occurring.shape, NO_ROW, dtype=np.int32), none, none, slots)
 

@@ -135,7 +135,7 @@ class WebSocketTransport(asyncio.Protocol):
 
     @property
     def is_blocked(self) -> bool:
-        """True if reading must stop, because the peer does not read the pongs that answer its pings."""
+        """True if reading must stop, because the peer sends pings but does not read the pongs."""
         return self._pongs_unread
 
     @property

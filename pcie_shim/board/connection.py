@@ -156,7 +156,7 @@ class Connection:
 
 
 class HostConnection(Connection):
-    """A host's connection to the register port. From its first request on, the host holds the board."""
+    """A host's connection to the register port. After this host's first request, other hosts are refused."""
 
     def __init__(
         self,

@@ -19,7 +19,7 @@ _MOST_NS: Final = 3600 * 10**9
 
 
 class Clock:
-    """A clock with times for stamps, and ticks for ages.
+    """A clock with times, which are compared with stamps, and ticks, which measure ages.
 
     A simulation runs at any rate, and may pause or restart. A restart sets the time back, but never the ticks.
     """

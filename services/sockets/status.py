@@ -1,4 +1,4 @@
-"""Status of processes: its records, and queries of one process or of all processes in a run (`terminal.health`)."""
+"""Records for the status of processes, and requests for the status of one process or of all processes in a run."""
 
 from __future__ import annotations
 

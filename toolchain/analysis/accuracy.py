@@ -167,19 +167,22 @@ def measure(
     advance: Callable[[], None] = lambda: None,
     run: Run = in_this_process,
 ) -> Accuracy:
-    """Run a machine on readings and compare its posteriors with exact inference.
+    """Run a machine on readings, and compare the machine's posteriors with exact inference.
 
-    `replicas` successive readings form a frame. A frame takes the cycles of its longest run. A single machine is run
-    for all replicas, because replicas with equal seeds have equal counts. Without a `model`, the machine is compared
-    only with exact inference on its codes. A reading that is impossible in the model has no posterior. `advance` is
-    called after every reading.
+    A frame consists of `replicas` successive readings. The readings are run one by one on a machine without replicas,
+    because each replica gets the same counts as a machine with the same seeds. The longest of these runs gives the
+    cycles of the frame. `advance` is called after every reading.
+
+    The posteriors are compared with exact inference from the machine's codes. With a `model`, they are also compared
+    with exact inference from the model. If a reading is impossible in the model, exact inference gives no posterior
+    for the reading.
 
     `own` is the filter of a deployment. With `own`, the readings are a sequence, and each reading is run with one bank
     of seeds. Each posterior is compared with the posterior of the exact filter.
 
     Raises:
         BuildError: There are fewer readings than replicas.
-        ModelError: No frame is possible in the model.
+        ModelError: No reading is possible in the model.
     """
     if len(readings) < replicas:
         raise BuildError(

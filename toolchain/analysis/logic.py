@@ -83,7 +83,7 @@ class Of(StrEnum):
     """A bit of a cell's code, in bm1_stochastic_bitstream_generator.
 
     The logic of the bit compares the random number with the code, and tests the code for all ones and all zeros. It
-    also has a part of the AND of bm1_tile_element."""
+    also includes this bit's share of the AND in bm1_tile_element."""
     COUNTER_BIT = "counter bit"
     """A bit of a counter, in bm1_counter, bm1_readout and bm1_matrix.
 
@@ -284,7 +284,12 @@ class EqualMemories:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Memories:
-    """The memories of a machine. `logic_tables` tables are in memory LABs, because all M20K blocks are used."""
+    """The memories of a machine.
+
+    Attributes:
+        logic_tables: Number of tables in memory LABs. A table of a BM1 is in memory LABs if no M20K block is left for
+            it. A table of a BM2 is in memory LABs if it is small.
+    """
 
     table_bits: int
     blocks: int

@@ -35,7 +35,7 @@ class Estimate:
 
     @property
     def alms(self) -> float:
-        """Number of ALMs: those for memory, plus the larger of the numbers for look-up tables and for registers."""
+        """Number of ALMs: those of the memories, plus those for look-up tables or for registers, whichever are more."""
         logic = max(self.logic.alms, self.logic.registers / self.device.registers_per_alm)
         return logic + self.memories.alms
 

@@ -202,7 +202,7 @@ class Symbol:
 
     @property
     def reading(self) -> dict[str, Any]:
-        """Those keyword arguments of `Known` or `PriorSelect` that the symbol defines."""
+        """Keyword arguments of `Known` and `PriorSelect` that describe the symbol. The caller adds the table."""
         return {
             "name": self.name,
             "bits": self.bits,

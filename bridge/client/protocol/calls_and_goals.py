@@ -217,8 +217,8 @@ class ServedServices(_Served):
     def answer(self, ticket: int, values: Mapping[str, Any] | str, *, ok: bool = True) -> None:
         """Answer a request with fields, or with a reason as text if `ok` is False.
 
-        After a lost connection, the call has no effect. A reason is sent in an additional field `reason`, and `values`
-        is an empty object. The reference server drops an answer whose `values` is a text, so its caller would wait for
+        If the connection of the request was lost, do nothing. A reason is sent in an additional field `reason`, and
+        `values` is an empty object. The reference server drops an answer whose `values` is a text, so its caller would wait for
         ever (rosbridge_library/capabilities/service_response.py, `service_response_msg_fields`). `bridge.hub` passes
         the reason on.
 
