@@ -37,7 +37,10 @@ class ReaderGoneError(Exception):
 
 
 class ProcessError(Exception):
-    """A process that a command or a script started has failed. The error has the exit code of this process."""
+    """A process that a command or a script started has failed.
+
+    `exit_code` is the exit code of the failed process if the code is known and positive, otherwise `ExitCode.CHILD`.
+    """
 
     exit_code: int = ExitCode.CHILD
 

@@ -158,7 +158,8 @@ class Reassembler:
 def split(message: bytes, fragment_size: int, fragment_id: FragmentId) -> Iterator[bytes]:
     """Split the JSON of an operation into fragments.
 
-    A fragment contains at most `fragment_size` bytes of the JSON, or one longer character.
+    A fragment contains at most `fragment_size` bytes of the JSON. If a single character has more bytes than that, the
+    fragment contains the whole character.
 
     Yields:
         The message itself if it fits into one fragment. Otherwise the fragments as JSON, numbered from 0.

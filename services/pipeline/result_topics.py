@@ -25,7 +25,10 @@ from toolchain.deployment import Deployment
 
 ROLE = "publisher"
 RESULTS_DEPTH = 64
-"""Maximum number of results that wait for the rosbridge server. The master has fewer frames under way."""
+"""Maximum number of results that wait in the publisher for the rosbridge server.
+
+A master does not reach this maximum, because it computes no frame while `MOST_AT_PUBLISHER` results are unanswered.
+"""
 
 
 def same_numbers(received: Any, sent: list[float], *, rel_tol: float = 1e-12, abs_tol: float = 0.0) -> bool:

@@ -251,11 +251,14 @@ def fitted_layout(
     what: str,
     advice: str = "",
 ) -> BoardLayout:
-    """Return the layout of boards, with an interface of the size `asked` (inputs, results).
+    """Return the layout of boards that have the lines in `blocks`, and the same size of register interface.
 
-    If `asked` is None, the interface has the size that `used` needs. Raises a BuildError if a board does not fit the
-    interface, or the interface does not fit the register map. In errors, `what` describes a board. If a board does not
-    fit the register map, the error ends with `advice`.
+    `used` are the registers that the largest board needs. `asked` is the size of the interface (inputs, results), or
+    None for the size that `used` needs.
+
+    Raises a BuildError if `used` exceeds the interface or the register map, or if the interface exceeds the register
+    map. `what` describes the largest board in the error. If `used` exceeds the register map, the error ends with
+    `advice`.
     """
     needed, room = (used.input_words, used.result_words), interface_room(used)
     sentence = f"a board needs {counted(needed[0], 'input')} and {counted(needed[1], 'result')} ({what})"

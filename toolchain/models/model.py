@@ -163,7 +163,8 @@ class Model:
     prior: NDArray[np.float64] | None = None
     """P(S), float64[lines] summing to 1.
 
-    None means a uniform prior. With `prior_select`, None means the mean of the rows of its table.
+    If None is given, the prior is computed. With a filter, it is the prediction for the first frame. With
+    `prior_select`, it is the mean of the rows of `prior_select.table`. Otherwise it is uniform.
     """
     prior_select: PriorSelect | None = None
     """The variable that selects the prior, or None. While its reading is missing, `prior` applies."""
