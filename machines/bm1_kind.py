@@ -136,7 +136,7 @@ class BM1Kind(MachineKind):
         return joint if joint is not StopReason.NONE else StopReason.SLICE
 
     def infer(self, results: Sequence[BoardResult], _: Sequence[str] = ()) -> Inference:
-        """Return the joint posterior of all boards. Each board has some lines of the model, for every replica."""
+        """Return the posterior over the lines of all boards, or one such posterior after the other for replicas."""
         joint: npt.NDArray[np.float64] | None = None
         totals: list[int] = []
         if results and results[0].replica_cycles:

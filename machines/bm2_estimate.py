@@ -47,7 +47,7 @@ class ChainEstimate:
         effective_samples: Number of effective samples, summed over the boards, for the value with the smallest sum. It
             is NaN if it cannot be estimated, for example if all samples of a board have the same value.
         r_hat: The largest R-hat of all values. It is NaN for a single board, or if a board has too few samples.
-        left_out: Indices of the boards that are left out. A board is left out if it timed out or no sample counts.
+        left_out: Indices of the boards that are left out, because they timed out or have no valid sample.
     """
 
     posterior: Floats | None

@@ -97,7 +97,7 @@ def load(builder: Any, data: Any, place: Any) -> Any:
 
 @in_llvm(types.void, None, types.int64, VECTOR)
 def store(builder: Any, data: Any, place: Any, vector: Any) -> None:
-    """Write a vector to an array, as the vector with the index `place`."""
+    """Store a vector at the index `place` of an array of vectors."""
     builder.store(vector, builder.gep(builder.bitcast(data, _VECTOR.as_pointer()), [place])).align = 64
 
 

@@ -208,7 +208,7 @@ class GoalRequest:
         self._canceling.set()
 
     def feed_back(self, values: Mapping[str, Any]) -> None:
-        """Send feedback; no effect after the end."""
+        """Send feedback. Do nothing if the goal has ended."""
         if not self.ended:
             self._feed_back(values)
 

@@ -331,7 +331,8 @@ class Publication(Handle):
             DisconnectedError: There is no connection now, or the publication or the client is closed.
             SlowPeerError: The server did not accept the message in time, or `queue_size` messages are already waiting.
             MessageTooLargeError: The message is larger than `max_size`, or than the known limit of the server.
-                `bridge.hub` announces its limit. Another server reveals its limit by closing the connection once.
+                `bridge.hub` announces its limit. Other servers close the connection when a message is too large. After
+                that, the largest message sent on this connection counts as too large.
             MessageTypeError: The message has a field that its type does not have, or an array of another shape.
             EncodeError: The message cannot be sent as JSON. If a value is NaN or infinite, the error names the field.
         """

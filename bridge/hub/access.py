@@ -62,7 +62,10 @@ class AccessPolicy:
 
     @property
     def allowed_origins(self) -> list[Origin | re.Pattern[str] | None]:
-        """Return the origins that the handshake accepts. None admits programs, because only browsers send an origin."""
+        """Return the origins that the handshake accepts.
+
+        The element `None` stands for a request without an origin, as programs send it. Only browsers send an origin.
+        """
         return [None, LOCAL_ORIGIN, *map(Origin, self.origins)]
 
     def refusal(self, request: Request, *, loopback: bool) -> HTTPStatus | None:

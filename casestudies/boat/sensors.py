@@ -174,8 +174,8 @@ def readings_message(
 ) -> dict[str, Any]:
     """Return a message with six readings, in the order of `SENSOR_NAMES`, and with the header `head`, if any.
 
-    With `array`, the message is a std_msgs/Float64MultiArray without a header. A missing reading (None) is null in an
-    array, as rosbridge writes NaN. Without `array`, the field of a missing reading is absent.
+    With `array`, the message is a std_msgs/Float64MultiArray without a header, in which a missing reading (None) is
+    null, because rosbridge sends NaN as null. Without `array`, the field of a missing reading is absent.
     """
     if array:
         return {

@@ -331,8 +331,8 @@ def disparity_matcher(
 ) -> None:
     """Turn stereo pairs into disparity images with a stack whose boards hold a machine for each pixel of a tile.
 
-    Left and right images are paired by their stamps. A line for each pair compares the machines with float64 fusion.
-    If true disparities are published, the line also compares both with the true disparities.
+    Left and right images are paired by their stamps. For each pair, print a line that compares the machines with
+    float64 fusion. If true disparities are published, the line also compares both with the true disparities.
     """
     matcher = Matcher(disparities=disparities, pixels=pixels, clock=clock)
     if out is not None:

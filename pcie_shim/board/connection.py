@@ -167,7 +167,7 @@ class HostConnection(Connection):
         programmed: int,
         link: LinkModel | None,
     ) -> None:
-        """Store `token`, the token in the greeting, and `programmed`, the number of images loaded by the board."""
+        """Store the greeting's token (`token`) and the number of images loaded so far (`programmed`)."""
         super().__init__(connection, key, greeting, link)
 
         # A loader that shows this token may program the board although this host holds it: it is the same host.

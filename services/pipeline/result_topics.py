@@ -116,7 +116,10 @@ class ResultTopics:
             self._watched = self._outputs[0][0].subscribe(output.topic, output.type, queue_size=RESULTS_DEPTH)
 
     async def seen(self, timeout: float) -> bool:
-        """Return whether a result published since `watch` comes back in time. If one does, stop watching."""
+        """Return whether the server sends back a result published since `watch`, within `timeout` seconds.
+
+        If it does, end the subscription that `watch` made.
+        """
         if self._watched is None:
             return False
         # results of other publishers of the topic may arrive before

@@ -161,7 +161,7 @@ class ProcessStatus(msgspec.Struct, frozen=True, kw_only=True):
 class SilentProcess(msgspec.Struct, frozen=True):
     """A process whose status is unknown.
 
-    Either the process has a status socket without a usable answer, or the master waits for the process.
+    Either its status socket gave no usable answer, or it has no status socket and the master waits for the process.
     """
 
     name: str

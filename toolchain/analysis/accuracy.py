@@ -138,7 +138,7 @@ class Accuracy:
         without: Share of runs without a posterior, including runs in which all counts remained 0.
         overflow: Share of runs that ended with an overflow.
         machine: Difference of the machine from the model, or None without a model.
-        quantising: Difference of exact inference on the codes from the model, or None without a model.
+        quantising: Difference between the model and exact inference on the codes, or None without a model.
         sampling: Difference of the machine from exact inference on the machine's codes.
         z: Counts compared with equation 2.1, or None if no line's expected count is high enough.
     """

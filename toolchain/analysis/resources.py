@@ -1,8 +1,8 @@
 """Resources and energy of a BM1 on the FPGAs of its boards, and the number of boards that the BM1 needs.
 
-Tables are memories, so new tables need no new compilation. Nothing here was measured on a board. Logic is estimated.
-Energy is estimated from toggles of nets, and each toggle of any net costs the same energy. `ASSUMPTIONS` lists the
-constants.
+Tables are stored in memories, so new tables need no new compilation. Nothing here was measured on a board. Logic is
+estimated. Energy is estimated from toggles of nets, and each toggle of any net costs the same energy. `ASSUMPTIONS`
+lists the constants.
 """
 
 import math

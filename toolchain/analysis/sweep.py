@@ -50,7 +50,7 @@ class Point(BaseModel):
             has a total variation of 1.
         total_variation_low: Lower end of the 95 % interval of `total_variation`.
         total_variation_high: Upper end of the 95 % interval of `total_variation`.
-        quantising: Mean total variation of exact inference on the codes from the model's posterior.
+        quantising: Mean total variation between the model's posterior and exact inference on the machine's codes.
         map_agreement: Share of all frames in which machine and model have the same most probable line.
         alone_total_variation: `total_variation` over only the frames with a posterior, or None without such frames.
         alone_map_agreement: `map_agreement` over only the frames with a posterior, or None without such frames.

@@ -20,7 +20,10 @@ SHARED_BITS: Final = {
     "BM1": "means are correct, but the variance of counts is up to 2.6 times as large",
     "BM2": "this biases all samples",
 }
-"""Clauses by kind of machine: what happens if successive random numbers share bits."""
+"""The effect of random numbers that share bits with the numbers before them, by kind of machine.
+
+The texts end sentences of reports and findings.
+"""
 
 
 def build_report(model: Model, deployment: Deployment, quantised: Quantised, interface_reason: str) -> str:

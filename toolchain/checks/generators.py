@@ -182,7 +182,7 @@ def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> tuple
     search may stop before the last group.
 
     Returns:
-        One relation for each group that has relations, with the fewest bits, and the number of searched groups.
+        The relations (for each group at most one, with the fewest bits), and the number of searched groups.
     """
     groups, columns = seeds.shape
     bits = columns * prob_bits

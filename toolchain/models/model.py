@@ -111,7 +111,10 @@ class TabulatedVariable:
 
 
 def checked_variable(*, name: str, **rule: Any) -> Variable:
-    """Return a `deployment.toml` entry with the keys `rule`, or raise a ModelError if the entry would be invalid."""
+    """Return the variable's entry in `deployment.toml`, or raise a ModelError if the entry is invalid.
+
+    `rule` has the other keys of the entry and their values.
+    """
     try:
         return Variable(name=name, **rule)
     except ValidationError as reason:
