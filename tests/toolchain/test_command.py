@@ -14,7 +14,7 @@ from tests.patience import PROCESS_PATIENCE
 from tests.toolchain.running import TARGET, TINY, assert_refused, done, toolchain
 from toolchain.building.options import BuildOptions, MachineOptions, TargetOptions
 from toolchain.commands.request import BuildFlags, build_options
-from toolchain.deployment import Queue, Scale, load_deployment
+from toolchain.deployment import UNFINISHED, Queue, Scale, load_deployment
 from toolchain.outputs.mif import read_mif
 
 MODEL = TINY
@@ -164,6 +164,13 @@ def test_check_names_what_a_path_lacks(tmp_path):
         toolchain("check", tmp_path), tmp_path, "contains no model or deployment", "deployment.toml"
     )
     assert_refused(toolchain("check", tmp_path / "new"), tmp_path / "new", "does not exist", "model.py")
+
+
+def test_check_names_an_interrupted_build(tmp_path):
+    (tmp_path / UNFINISHED).touch()
+    checked = toolchain("check", tmp_path)
+    assert checked.exit_code == 2
+    assert f"the build of {tmp_path} has not ended or was interrupted" in checked.stdout
 
 
 @pytest.mark.parametrize("at", [0, 2, 4], ids=TARGET[::2])

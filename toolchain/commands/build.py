@@ -113,10 +113,11 @@ def check(
     del directory  # accepted, so that a `build` command becomes a check by changing only its first word
     from toolchain.checks.check import check_deployment
     from toolchain.checks.findings import Severity
-    from toolchain.deployment import FILE_NAME
+    from toolchain.deployment import FILE_NAME, UNFINISHED
     from toolchain.models import case_study
 
-    if (checked / FILE_NAME).is_file() and not (checked / case_study.FILE_NAME).is_file():
+    is_deployment = (checked / FILE_NAME).is_file() or (checked / UNFINISHED).is_file()
+    if is_deployment and not (checked / case_study.FILE_NAME).is_file():
         for flag in _model_flags(context):
             raise BuildError(
                 f"{flag} is for a model; {checked} is a deployment, which was built with its own"
