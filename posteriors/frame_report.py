@@ -61,7 +61,7 @@ class VariableReading(NamedTuple):
     address: int
     """Address in the variable's column."""
     age_ms: FiniteFloat
-    """Milliseconds from the receipt of the variable's message until the report is sent."""
+    """Age of the reading when the report is created, in milliseconds. docs/reference/topics.md defines this age."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
