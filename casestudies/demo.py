@@ -37,7 +37,7 @@ app = CommandLine()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Case:
-    """A case study as the demo runs it. Each command gets the options in this object. It also gets `--uri`."""
+    """A case study for the demo, with options of the commands. The demo adds `--uri` and other common options."""
 
     name: str
     topic: str

@@ -220,8 +220,9 @@ _PATIENCE_S: Final = 1.0
 class Listener:
     """The frames that a running stack publishes, each with its true position. `listen` creates a Listener.
 
-    A frame's true position has the frame's stamp, or is the newest earlier position, at most `tolerance_ns` older.
-    A tolerance is needed for readings without a header, because they are stamped only when they reach the host.
+    A frame gets the newest true position that is not later than the frame. If this position is more than
+    `tolerance_ns` older than the frame, the frame has no true position. With a tolerance of 0, the stamps must be
+    equal. Readings without a header need a tolerance above 0, because they get their stamp when they reach the host.
 
     Attributes:
         route: The true positions received, with the newest last.

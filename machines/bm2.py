@@ -277,9 +277,9 @@ class BM2Parameters:
         return tuple(colours[variable] for variable in range(len(neighbours)))
 
     def moves(self, known: int, sequencer: Sequencer) -> tuple[tuple[int, ...], ...]:
-        """Return the state bits that each move of a sweep draws, in rising order, without the bits in the mask `known`.
+        """Return the moves of a sweep. Each move is a tuple of the state bits that it draws, in rising order.
 
-        The sequencer `random` draws its moves from this list.
+        The bits in the mask `known` are in no move. The sequencer `random` draws its moves from this list.
         """
         if sequencer is not Sequencer.COLOURED:
             return tuple((bit,) for bit in range(self.state_bits) if not known >> bit & 1)

@@ -6,7 +6,9 @@ context, and each chain takes the bit for its own context. Each chain has a poin
 draws now. A new value of a bit is written only in the chains whose pointer is at this bit.
 
 Chains of a large network go in step: all chains make a move together, but each chain takes its own number of cycles.
-Vector operations search 8 chains at a time for the first cycle in which the CDEs agree. Other chains run one by one.
+Vector operations search 8 chains at a time for the first cycle in which the CDEs agree.
+
+Chains that can neither be sliced nor go in step run one by one, for example fewer than 16 chains.
 """
 
 from collections.abc import Sequence
@@ -301,11 +303,11 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
 ) -> bool:
     """Run bit-sliced chains until each has drawn its samples, and store the number of cycles of each chain in `ends`.
 
-    Return False if `max_cycles` or the timeout of the OPS may stop a chain before that.
+    Return False, before the chains are finished, if `max_cycles` or the timeout of the OPS may stop a chain too early.
 
     `vectors` contains `numbers`, `values`, `pointed`, `counts` and `room`. `counts` has a counter for each joint value
-    of the unknown bits. The counter of value 0 counts sweeps, and overflows at the end of the burn-in and at the end of
-    the chain. Every other counter counts the samples with its value.
+    of the unknown bits. The counter of a joint value counts the samples with this value. The exception is the
+    counter of value 0: it counts sweeps, and overflows at the end of the burn-in and at the end of the chain.
     `room` is working space for carries, for the bits of contexts, and for the events of a sample.
     """
     numbers, values, pointed, counts, room = vectors

@@ -315,7 +315,10 @@ def fill(wiring: Wiring, numbers: npt.NDArray[np.uint16], generators: Words, one
 
 @jit
 def refill(exponents: Integers, numbers: npt.NDArray[np.uint16], first: int, rows: int) -> None:
-    """Replace rows of `numbers` by the random numbers of the next block, from the vector with the index `first` on."""
+    """Replace the random numbers in `rows` successive rows of `numbers` by those of the next block.
+
+    A row has the random numbers of one CDE, as vectors of `CHUNK` numbers. The first row begins with vector `first`.
+    """
     top, near = exponents[0], exponents[2] == 2  # then the exponents are 32, 22, 2 and 1
     for row in range(first, first + rows * (top + 1), top + 1):
         last, older = load(numbers, row + top - 1), load(numbers, row + top - 2)

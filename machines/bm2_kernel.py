@@ -111,7 +111,11 @@ class BM2Kernel(ABC):
         return self._continue(pause_at)
 
     def step(self, pause_at: int = 0) -> BM2StopReason:
-        """Continue after a pause. If the frame is not paused or cycle `pause_at` has passed, raise a StartError."""
+        """Continue after a pause. The machine pauses again after cycle `pause_at`, unless `pause_at` is 0.
+
+        Raises:
+            StartError: The machine is not paused, or cycle `pause_at` has already passed.
+        """
         if self.reason is not BM2StopReason.PAUSED:
             raise StartError(
                 f"The machine is not paused: it has stopped with reason {self.reason.name.lower()}."

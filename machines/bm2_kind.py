@@ -340,8 +340,8 @@ class Kept(msgspec.Struct, array_like=True):
         samples: Number of samples drawn so far.
         unused: Number of samples that no histogram counts.
         timed_out_bit: The state bit on which the CDEs did not agree in time, or -1 if there is no such bit.
-        batches: The result words at the end of each batch, if the machine has no stream. In a `BoardResult`, its
-            `words` are the words of the last batch, and `batches` ends with the batch before.
+        batches: The result words at the end of each batch, if the machine has no stream. When the frame has ended, the
+            last batch is removed from `batches`, because `BoardResult.words` contains the words of the last batch.
         stream: The sampled states. Each state has `state_words` words.
     """
 

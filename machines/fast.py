@@ -106,7 +106,10 @@ class FastBM1(BM1Kernel):
 
     @property
     def kept_cycles(self) -> int:
-        """Number of cycles at the start of a frame for which the cache has room, for each bank of seeds."""
+        """Number of cycles that the cache can hold for each bank of seeds, counted from the start of a frame.
+
+        0 means that no bits are cached between frames.
+        """
         return 0 if self._of_frame else self._kept_blocks * BLOCK_CYCLES
 
     def prepare(self) -> None:

@@ -84,7 +84,7 @@ def store_of_codes(occurring: npt.NDArray[np.bool_], slots: int) -> _Store:
 
 
 def store_of_frame(occurring: npt.NDArray[np.bool_], cells: int, slots: int) -> _Store:
-    """Allocate a store for the codes of one frame. Each frame assigns the rows of the store to its own codes.
+    """Allocate a store that holds the codes of one frame at a time. Every new frame assigns the rows to its own codes.
 
     The number of rows is the number of codes that may occur, but at most the number of cells.
     """
@@ -404,10 +404,12 @@ def begin(
     period: int,
     new_rows: bool,
 ) -> int:
-    """Select the lines of every replica, run the first slice of every replica, and fill in `frame.outcome`.
+    """Find the lines that can count in each replica, run the first slice of each replica, and fill in `frame.outcome`.
 
-    Returns the number of rows of the store that have a code. Every row gets its code before the first block is run, so
-    a row has the same code in all replicas. A replica in which no line can count runs no cycle.
+    With `new_rows`, each code that the frame uses gets a row of the store before the first block is run. All replicas
+    use the same row for the same code of a column. A replica in which no line can count runs no cycle.
+
+    Returns the number of rows that were assigned to codes, or 0 without `new_rows`.
     """
     rows = _NO_ROWS
     for replica in range(codes.shape[0]):

@@ -154,9 +154,9 @@ class UsedRegisters:
 class BoardMachine(ABC):
     """The machine of a board. It reads its inputs from the board's registers and writes its results there.
 
-    The machine runs only within calls. `start` and `resume` begin a slice after a doorbell; `step` continues the slice.
-    All three methods stop at cycle `end` at the latest. An `end` of 0 sets no limit. The results are then in the blocks
-    of `UsedRegisters.answer`.
+    The machine runs only during calls of `start`, `resume` and `step`. After a doorbell, `start` or `resume` begins a
+    slice. `step` continues a slice. Each call ends at cycle `end` at the latest; an `end` of 0 sets no limit. After
+    each call, the results are in the blocks of `UsedRegisters.answer`.
     """
 
     def __init__(self, kernel: Any, memory: Mapping[str, memoryview]) -> None:
@@ -223,10 +223,11 @@ class FrameCourse(ABC):
     def proceed(
         self, reasons: Sequence[Sequence[int]], answers: Sequence[memoryview]
     ) -> tuple[Sequence[int], Blocks]:
-        """Return the numbers of the boards to resume, or none if the frame is over, and the blocks to write first.
+        """Return the indices of the boards to resume, and the blocks to write to each of them before its resume.
 
-        For each board, `reasons` has the last stop reasons of its replicas, and `answers` has the words of the blocks
-        in `UsedRegisters.answer`. A board's words are valid until the board is resumed.
+        If the frame is over, there are no indices. For each board, `reasons` has the last stop reasons of its replicas,
+        and `answers` has the words of the blocks in `UsedRegisters.answer`. A board's words are valid until the board
+        is resumed.
         """
 
     def conclude(self, results: Sequence[BoardResult]) -> Sequence[BoardResult]:

@@ -167,7 +167,7 @@ class TableNumbers:
     table: npt.NDArray[np.uint32]
 
     def restart(self, bank: int) -> Words:
-        """Return the index at which each generator starts in a bank: uint64[`generator_shape`]."""
+        """Return the indices into the table from which the generators start for a bank: uint64[`generator_shape`]."""
         shape, sets = self.parameters.generator_shape, self.parameters.rng_banks * self.parameters.chains
         count, own = math.prod(shape), seed_set(self.parameters, bank)
         # Python integers, because the products may exceed 64 bits

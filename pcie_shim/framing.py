@@ -205,7 +205,7 @@ def decode_error(frame: Frame) -> tuple[int, str]:
 
 _PROGRAM_BEGIN: Final = struct.Struct("<Q32s8s")
 NO_TOKEN: Final = bytes(8)
-"""The token of a loader whose host has no link to the board."""
+"""Zeros in place of a token. A loader sends them if the loader's host has no link to the board."""
 
 
 class ProgramBegin(NamedTuple):

@@ -30,7 +30,7 @@ def wait_until(tick_ns: int) -> None:
 class LinkModel:
     """A simulated wire to one board, or to several boards.
 
-    If `wire.shared` is set, all board processes that are forked from this process later use the same wire.
+    If `wire.shared` is set, all board processes that this process forks afterwards share one wire.
     """
 
     def __init__(self, wire: LinkFigures, wait: Callable[[int], None] = wait_until) -> None:

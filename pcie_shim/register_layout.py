@@ -14,7 +14,10 @@ WORD: Final = struct.Struct("<I")
 """A register of 32 bits."""
 
 SETTINGS: Final = struct.Struct("<IQII")
-"""The registers TARGET_COUNT, MAX_CYCLES, BANK and PRIOR_SELECT. The next registers are RUN_UNTIL and the doorbells."""
+"""The registers TARGET_COUNT, MAX_CYCLES, BANK and PRIOR_SELECT.
+
+In the register map, RUN_UNTIL and the doorbells follow these registers, so one burst can write all of them.
+"""
 
 DONE_BLOCK: Final = struct.Struct("<IIQQ")
 """The registers DONE, STATUS, CYCLES and COMPUTE_NS."""

@@ -32,7 +32,7 @@ class ErrorCode(IntEnum):
     BLANK = 6  # no image has been loaded
     DOORBELL = 7  # the number written to START or RESUME is not DONE + 1, or there is nothing to resume
     BAD_VALUE = 8  # the machine does not accept a value: an address, the target, the bank or a number of cycles
-    STALE = 9  # the board was programmed after this handle was opened
+    STALE = 9  # the board was programmed after this host had opened the board
     HELD = 10  # another host holds the board, or another loader is programming it
     BAD_FRAME = 11  # a link frame has an invalid operation, length, CRC or sequence number. The board closes the link
     BAD_IMAGE = 12  # the image is damaged, or was built for another map or board

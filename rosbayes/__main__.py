@@ -28,8 +28,8 @@ def rosbayes(
 ) -> None:
     """Bayesian machines for any ROS robot.
 
-    Start with `rosbayes demo`. Each other subcommand is also a separate command: `rosbayes hub` is `hub`, and
-    `rosbayes build` is `toolchain build`.
+    Start with `rosbayes demo`. All other subcommands have a second name: `rosbayes hub` is also `hub`, and
+    `rosbayes build` is also `toolchain build`.
     """
 
 

@@ -43,7 +43,7 @@ class Settings(BaseModel):
     )
     use_sim_time: bool = Field(
         default=False,
-        description="Measure the age of readings in the simulated time of /clock, and stamp readings without a stamp with it.",
+        description="Measure the age of readings in the simulated time of /clock; a reading without a stamp gets the simulated time of its receipt.",
     )
     queue: Annotated[Literal["latest", "all"] | None, Flag(otherwise=_DEPLOYMENTS)] = Field(
         default=None,

@@ -82,7 +82,11 @@ def _now() -> str:
 
 
 def formatted(level: str, text: str, *, name: str = "") -> str:
-    """Return a text for the user: as JSON with its level, as `name: level: text`, or at level `info` as text alone."""
+    """Return a text for the user in the current log format.
+
+    In JSON, an object contains the level and the text. Otherwise the result is `name: level: text`, or the text alone
+    if the level is `info`.
+    """
     if log_format() is LogFormat.JSON:
         return json_line(level, text)
     prefix = f"{name}: " if name else ""
@@ -180,7 +184,10 @@ def log_libraries(level: int, form: str) -> None:
 
 
 def escape_last_resort() -> None:
-    """Escape control characters in libraries' warnings before logging is configured. A warning may quote a server."""
+    """Escape control characters in warnings that libraries log before logging is configured.
+
+    A warning may contain text that a server sent.
+    """
     if logging.lastResort is not None:
         logging.lastResort.setFormatter(_OneLine())
 

@@ -100,8 +100,9 @@ def verilog(
 ) -> str:
     """Return a board's hardware as Verilog, or raise a HardwareToolError.
 
-    `folder` contains the package of parameters. `table` is the Verilog of `bm1_table`. `hdl` is the folder of the VHDL,
-    and `more_sources` are further VHDL files, relative to `hdl`.
+    `folder` contains the package of parameters. `table` is Verilog text with the module `bm1_table`, the only module
+    that GHDL does not translate. `hdl` is the folder of the VHDL, and `more_sources` are further VHDL files, relative
+    to `hdl`.
     """
     # without its entity, the table's component remains unbound: a black box
     names = [name for name in SOURCES if name != "bm1_table.vhd"]

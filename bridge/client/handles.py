@@ -156,7 +156,10 @@ class Subscription(Handle):
         self.discarded += 1
 
     def leave_out(self, reason: str) -> None:
-        """Record why the client no longer subscribes to the topic. After queued messages, the reader gets the error."""
+        """Record why the client no longer subscribes to the topic.
+
+        The reader still gets the queued messages. Then it gets a `TopicLeftOutError` with the reason.
+        """
         _log.warning("%s %s", self.topic, reason)
         self._left_out = reason
         self._wake()
@@ -331,8 +334,9 @@ class Publication(Handle):
             DisconnectedError: There is no connection now, or the publication or the client is closed.
             SlowPeerError: The server did not accept the message in time, or `queue_size` messages are already waiting.
             MessageTooLargeError: The message is larger than `max_size`, or than the known limit of the server.
-                `bridge.hub` announces its limit. Other servers close the connection when a message is too large. After
-                that, the largest message sent on this connection counts as too large.
+                `bridge.hub` announces its limit. Other servers close the connection when a message is too large. The
+                client then refuses every message that is at least as large as the largest message sent on the closed
+                connection.
             MessageTypeError: The message has a field that its type does not have, or an array of another shape.
             EncodeError: The message cannot be sent as JSON. If a value is NaN or infinite, the error names the field.
         """

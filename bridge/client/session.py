@@ -339,7 +339,10 @@ class Session:
         return f"; the largest so far was one of {largest}, with {size} bytes" if size else ""
 
     def why_left_out(self) -> str:
-        """Return the end of an error text: the topic is left out, because one of its messages exceeded `max_size`."""
+        """Return the end of an error text that begins with the name of a topic.
+
+        The text says why the client no longer subscribes to the topic: a message was larger than `max_size`.
+        """
         return (
             f"is left out: a message of it has more than the {self.core.wire.max_size} bytes (max_size) that this "
             f"client of {self.uri} accepts"
@@ -429,7 +432,7 @@ class Session:
             )
 
     def must_wait(self) -> bool:
-        """Return whether a message must wait for its turn.
+        """Return whether a message must wait, because the socket is full or earlier messages wait.
 
         Raises:
             DisconnectedError: There is no connection.

@@ -11,7 +11,7 @@ from bridge.errors import MessageTypeError, NameFormError
 from bridge.names import ros1_type, ros2_type
 
 SCALAR: Final = -1
-"""The `length` of a `FieldType` if the field is no array. An array of any length has the `length` 0."""
+"""The `length` of a `FieldType` if the field is no array. 0 stands for an array without a fixed length."""
 _MAX_TYPES: Final = 1000
 _MAX_FIELDS: Final = 1000
 _MAX_LENGTH: Final = (1 << 32) - 1

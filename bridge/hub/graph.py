@@ -17,7 +17,10 @@ from bridge.hub.outbox import Lane, Outbox
 
 @dataclass(eq=False, slots=True)
 class Client:
-    """A connected client. The hub assigns an id to each call and each goal. The fields call this id the key."""
+    """A connected client.
+
+    The hub gives each call and each goal an id of its own. The docstrings of the fields call this id a key.
+    """
 
     number: int
     """The number of the client: 1, 2, ... in the order of connection."""
@@ -103,7 +106,7 @@ class TopicSubscription:
     client: Client
     topic: "Topic"
     prefix: bytes
-    """The beginning of each publish operation sent to the client as JSON, up to the message. The topic is `name`."""
+    """The first bytes of each publish operation sent to the client as JSON, up to the message. They contain `name`."""
     name: str
     """The topic's name as the client writes it, with or without the leading slash."""
     lane: Lane = field(default_factory=Lane)
@@ -121,7 +124,11 @@ class Topic:
     name: str
     """Absolute name."""
     largest: int
-    """Maximum size of a message as JSON, in bytes: that of an operation, minus the bytes around the message."""
+    """Maximum size of a message as JSON, in bytes.
+
+    A publish operation has at most `HubLimits.message_bytes`. The size of the operation without the message is
+    subtracted.
+    """
     type: str = ""
     """Type in the form of this hub's ROS version, or an empty string while no client has named a type."""
     advertisements: dict[Client, Advertisement] = field(default_factory=dict)

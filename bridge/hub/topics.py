@@ -117,12 +117,13 @@ class Topics:
             self.distribute(topic, parsed, now)
 
     def publish_known(self, client: Client, messages: Sequence[bytes], first: int, now: float) -> int:
-        """Perform `publish` operations without parsing their envelopes, the bytes before the value of `msg`.
+        """Perform `publish` operations without parsing their envelopes.
 
-        The hub knows an envelope from an earlier operation of the client. `messages` may contain any operations, and
-        `first` is the index of the first operation to perform. The method stops at an operation that must be parsed
-        in full, or when the client's turn is over. Return the index of the first operation that was not performed, or
-        `len(messages)` if all were performed.
+        An envelope is all bytes before the value of `msg`. The hub learnt the envelope from an earlier operation.
+
+        `messages` may contain any operations, and `first` is the index of the first operation to perform. The method
+        stops at an operation that must be parsed in full, or when the client's turn is over. Return the index of the
+        first operation that was not performed, or `len(messages)` if all were performed.
         """
         advertisement = client.last_published
         while advertisement is not None and first < len(messages) and self._dispatcher.work <= TURN_WORK:

@@ -120,7 +120,7 @@ class Boat:
         return SWITCHES[name][0 if on else 1]
 
     def sail(self, seconds: float) -> None:
-        """Move the boat along its waypoints for `seconds`. If the switch `sail` is off, move it as it is driven."""
+        """Move the boat for `seconds` along its waypoints, or at the velocity of `drive` if `sail` is off."""
         if not self.switches["sail"]:
             driven = min(seconds, self._driven)
             self._driven -= driven

@@ -236,8 +236,9 @@ class Matcher:
         first_limit_s: float,
         limit_s: float,
     ) -> None:
-        """Match `count` pairs, or pairs until cancelled if `count` is None, and print a line for each pair.
+        """Match pairs of images, and print a line for each pair.
 
+        The method ends after `count` pairs. If `count` is None, it runs until it is cancelled.
         `as_message` is the function `disparity_message`, with the arguments about the cameras filled in.
 
         Raises:

@@ -218,8 +218,9 @@ class MiniCluster:
     def collect(self, seconds: float) -> FrameOutput | None:
         """Receive the answers to the posted frame. After the last answer, start the next slice, if any.
 
-        `collect` waits for at most `seconds`. It returns the frame's result, or None if boards are still running. In
-        this case, poll `awaited` before the next call. Raises the errors of `run`.
+        `collect` waits for at most `seconds`. It returns the frame's result, or None if boards are still running.
+        After None, wait until the file descriptor `awaited` is readable, and call `collect` again. Raises the errors
+        of `run`.
         """
         progress = self._progress
         if progress is None:

@@ -1,4 +1,4 @@
-"""Processes of emulated boards: a single board, or a mini-cluster forked from a process with compiled code."""
+"""Processes of boards: one process for a single board, or a process that loads the kernels and forks several boards."""
 
 import asyncio
 import os

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 KEPT_FRAMES: Final = 1000
 KEPT_BYTES: Final = 128 << 20
-"""Maximum size of all kept posteriors together, in bytes. If the grid is fine, fewer than `KEPT_FRAMES` are kept."""
+"""Maximum size of all kept posteriors together, in bytes. Of large posteriors, fewer than `KEPT_FRAMES` are kept."""
 STAGE_SECONDS: Final = 300
 RATE_SECONDS: Final = 5
 STAGES: Final = tuple(each.name for each in fields(StageTimes) if each.name != "boards_compute")

@@ -1,7 +1,7 @@
 """Connections to a deployment's rosbridge servers, and checks of the deployment's topics at the servers.
 
-`connect_all` connects to each server once. Only a server with rosapi can say whether a topic of readings has
-a publisher, and whether results can be received.
+`connect_all` connects to each server once. The checks ask rosapi for the publishers and the types of topics. If a
+server has no rosapi, only the server's status messages can show that it refused a topic.
 """
 
 import asyncio

@@ -123,7 +123,10 @@ class StandardTopics:
             self._timer = loop.call_soon(self._send) if wait <= 0 else loop.call_later(wait, self._send)
 
     def flush(self) -> None:
-        """Before the run ends, send a waiting frame and the health of boards and services at once."""
+        """Send the messages of a waiting frame now, and then the health of boards and services.
+
+        Called just before the run ends.
+        """
         if self._timer is not None:
             self._timer.cancel()
         self._send()

@@ -284,7 +284,8 @@ async def report_failure(link: Link, error: BaseException) -> None:
 def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None:
     """Return an error that advises a restart, if the deployment's folder was rebuilt since this process loaded it.
 
-    Return None if the folder does not contain the deployment that the master's `refused` hello names.
+    `refused` is the first record of a refused master. Return None if the record is not a `Hello`, or if the folder
+    does not contain the deployment that the `Hello` names.
     """
     if not isinstance(refused, Hello) or refused.deployment_hash == deployment.hash:
         return None

@@ -169,9 +169,9 @@ def measure(
 ) -> Accuracy:
     """Run a machine on readings, and compare the machine's posteriors with exact inference.
 
-    A frame consists of `replicas` successive readings. The readings are run one by one on a machine without replicas,
-    because each replica gets the same counts as a machine with the same seeds. The longest of these runs gives the
-    cycles of the frame. `advance` is called after every reading.
+    A frame consists of `replicas` successive readings, one per replica. The readings are run one by one on a machine
+    without replicas. With equal seeds, such a machine and a replica give the same counts. The cycles of the frame are
+    the cycles of the longest run. `advance` is called after every reading.
 
     The posteriors are compared with exact inference from the machine's codes. With a `model`, they are also compared
     with exact inference from the model. If a reading is impossible in the model, exact inference gives no posterior

@@ -1,11 +1,12 @@
 """Exact analysis of the Markov chain of a BM2 with few bits: law, cycles and correlations.
 
-The law is the distribution of the chain's state. In a move, a BM2 points at one or several bits. In every cycle of a
-move, each CDE whose factor contains the bit draws 0 or 1. The bit is written when all these CDEs agree. If random
-numbers are ideal, the probability that all CDEs draw 1 is the product of their probabilities of a 1. The probability
-that all draw 0 is the product of the complements. These products give the transition matrix of a sweep. The matrix
-gives all values that long runs approach. The codes are those of the machine, so the effects of quantising and clipping
-are included. If the machine takes a sample after every move, the analysis still uses only one sample per sweep.
+The law is the distribution of the chain's state. A move writes one or several bits of the state. In every cycle of the
+move, each CDE draws 0 or 1. A bit is written when all CDEs whose factors contain this bit draw the same value. If
+random numbers are ideal, the probability that these CDEs all draw 1 is the product of their probabilities of a 1. The
+probability that they all draw 0 is the product of the complements. These products give the transition matrix of a
+sweep. The matrix gives all values that long runs approach. The codes are those of the machine, so the effects of
+quantising and clipping are included. If the machine takes a sample after every move, the analysis still uses only one
+sample per sweep.
 """
 
 import itertools
@@ -34,10 +35,11 @@ _WORK: Final = 2**27
 def agreement(
     machine: BM2Machine, bit: int, values: Mapping[int, NDArray[np.int64]]
 ) -> list[tuple[int, NDArray[np.float64]]]:
-    """Return an item for each CDE whose factor contains a bit.
+    """Return an item for each CDE whose factor contains the state bit `bit`.
 
-    An item is the index of the CDE, and the CDE's probability of drawing 1 in each state, float64[states]. `values`
-    maps each other bit of these factors to the value of that bit in each state, int64[states].
+    An item is the index of the CDE, and the probability in each state that the CDE draws 1 for `bit`, float64[states].
+    The keys of `values` are the other bits of these factors. A bit's entry is the bit's value in each state,
+    int64[states].
     """
     p, found = machine.parameters, []
     variable = next(at for at, mask in enumerate(p.masks) if mask >> bit & 1)

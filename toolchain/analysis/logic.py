@@ -94,9 +94,9 @@ class Of(StrEnum):
     STEP = "step"
     """A step of an LFSR in a cycle, in bm1_lfsr. Its logic computes the parity of the taps."""
     PLACE_BIT = "place bit"
-    """A bit of the index with which bm1_table_player reads a table of random numbers.
+    """A bit of the index in bm1_table_player. The index selects the current random number in a table.
 
-    The logic of the bit computes this bit of the next index.
+    The logic of the bit computes the same bit of the next index.
     """
     WORD = "word"
     """A word that the host writes for a frame, in bm1_words. Its logic decodes the address and checks the value."""
@@ -339,7 +339,10 @@ def word_memories_of(p: BM1Parameters, inputs: int = 0) -> list[EqualMemories]:
 def place_memories(
     parameters: BM1Parameters, device: Device, table_length: int = LENGTH, inputs: int = 0
 ) -> Memories:
-    """Place tables in the M20Ks that other memories leave free, the deepest first. The others go into memory LABs."""
+    """Place tables in M20Ks, the deepest tables first. When the usable M20Ks are full, place tables in memory LABs.
+
+    The memories of random numbers and of words come before all tables, and are always in M20Ks.
+    """
     tables = tables_of(parameters)
     room = math.floor(device.usable * device.blocks)
     others = random_memories_of(parameters, table_length) + word_memories_of(parameters, inputs)

@@ -172,7 +172,7 @@ def _machine_answer(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contents:
-    """The variables of a network, the searched variables, and the pairs that a BM1 cannot know together."""
+    """A network's variables, the searched variables, and the pairs that cannot both be known variables of a BM1."""
 
     joint: JointDistribution
     searched: tuple[str, ...] = ()

@@ -56,7 +56,7 @@ class Readings:
         return addresses, None if row == MISSING else row
 
     def of_machine(self, frame: int, machine: BM1Machine) -> tuple[Inputs, int]:
-        """Return the inputs and the prior's row of a frame in the form for a machine.
+        """Return the inputs of a frame for a machine, and the number of the row that is the frame's prior.
 
         A missing reading becomes the top address of the column. If each line has readings of its own, the readings of
         all lines are returned, even if the machine has only some of the lines.

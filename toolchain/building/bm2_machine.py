@@ -133,7 +133,7 @@ def chain_machines(plan: BM2Plan) -> tuple[BM2Machine, ...]:
 
 
 def clipped(factor: NDArray[np.float64], prob_bits: int) -> tuple[int, int, int]:
-    """Return the numbers of clipped odds, of odds clipped because of a zero, and of all odds in a factor.
+    """Count the odds in a factor. Return three counts: clipped odds, odds clipped because of a zero, and all odds.
 
     Odds compare two values of one variable, with all other variables unchanged. The binary codes of the two values
     differ in one bit. Odds are clipped if they are too extreme for a probability code.

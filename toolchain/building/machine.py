@@ -63,7 +63,7 @@ class MachinePlan:
     parameters: BM1Parameters
     """The parameters of the whole machine, with the lines of all boards."""
     target_count: int
-    """Count of a line at which the machine stops."""
+    """The machine stops when the counter of a line reaches this value."""
     max_cycles: int
     """The maximum number of cycles of a frame."""
 
@@ -251,7 +251,7 @@ def fitted_layout(
     what: str,
     advice: str = "",
 ) -> BoardLayout:
-    """Return the layout of boards that have the lines in `blocks`, and the same size of register interface.
+    """Return the layout in which each board has its block of `blocks`. All boards have an equally large interface.
 
     `used` are the registers that the largest board needs. `asked` is the size of the interface (inputs, results), or
     None for the size that `used` needs.

@@ -69,7 +69,8 @@ class Quantised:
     prior: NDArray[np.uint16]
     """uint16[rows, lines]: one row or, if a variable selects the prior, one row for each address of the variable.
 
-    In the second case, the last row is the prior without a selection. Rows of addresses without a value contain 0.
+    In the second case, the last address stands for a missing reading. Its row is the prior of the model. Rows of
+    addresses that stand for no value contain 0.
     """
     tables: tuple[NDArray[np.uint16], ...]
     """uint16[2**bits, lines] per known variable. Rows of addresses that stand for no value contain 0. The last row is

@@ -20,9 +20,9 @@ SHARED_BITS: Final = {
     "BM1": "means are correct, but the variance of counts is up to 2.6 times as large",
     "BM2": "this biases all samples",
 }
-"""The effect of random numbers that share bits with the numbers before them, by kind of machine.
+"""How a machine is affected if consecutive random numbers share bits, by kind of machine.
 
-The texts end sentences of reports and findings.
+Each text is the last part of a sentence in a report or a finding.
 """
 
 

@@ -98,7 +98,10 @@ class SourcesFile:
 
 
 def read_sources(path: Path, uri: str | None) -> SourcesFile:
-    """Read a sources file, or raise a BuildError with the line. `uri` is the server of each source without a server."""
+    """Read a sources file, or raise a BuildError with the line.
+
+    `uri` is the server of each source that names no server. If `uri` is None, every source must name its server.
+    """
     toml = TomlFile.read(path, BuildError)
     tables = toml.tables.get("source")
     for at, table in enumerate(tables if isinstance(tables, list) else ()):

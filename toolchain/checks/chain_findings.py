@@ -42,7 +42,11 @@ _MOVE_CYCLES: Final = 3.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CheckedChain:
-    """The machine of a BM2's first board, for the checks. Without `model`, values of hidden variables have no names."""
+    """The machine of a BM2's first board, for the checks.
+
+    Without `model`, only known and searched variables have names for their values. The values of all other variables
+    are shown as numbers.
+    """
 
     deployment: Deployment
     machine: BM2Machine

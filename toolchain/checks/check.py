@@ -213,7 +213,11 @@ _LEAST_TOLERANCE_S: Final = 0.005
 
 
 def source_findings(deployment: Deployment) -> Iterator[Finding]:
-    """Find topics without a header, if there are several: their messages are paired by the time of receipt."""
+    """Find topics whose messages have no header, if the deployment has several topics.
+
+    Messages without a header are paired with the messages of other topics by the time of receipt.
+    There is no finding if no topic has a header and the tolerance is large enough.
+    """
     if len(deployment.sources) < 2:
         return
     bare = [source.topic for source in deployment.sources if not _may_have_header(source.type)]

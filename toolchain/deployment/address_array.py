@@ -84,8 +84,9 @@ MISSING: Final = -1
 def to_addresses(deployment: Deployment, variable: Variable, value: object) -> list[int] | None:
     """Return the addresses of one variable's readings in a frame, or None if all readings are missing.
 
-    There is one address per element of the array, row by row. For a missing reading, the address is `MISSING` on all
-    lines. If the machine's `sensor_mode` is `threshold`, a sensor has codes instead of addresses.
+    There is one address per element of the array, row by row. The address of a missing reading is `MISSING`. If each
+    line has its own reading, a sensor's readings must be missing on all lines of a machine, or on none. If the
+    machine's `sensor_mode` is `threshold`, a sensor has codes instead of addresses.
 
     `value` is the value of the field: a flat array, or an array of the shape `deployment.reading_shape(variable)`. An
     array `uint8[]` may be bytes or base64 text. A null or NaN in the array is one missing reading. If `value` is `None`

@@ -176,7 +176,7 @@ class Scale(StrEnum):
     ADDRESS = "address"
     """Each row (the probabilities for one address) is a part. With this choice, a machine needs the fewest cycles."""
     COLUMN = "column"
-    """The whole table of a column is one part. This choice keeps the ratios between rows."""
+    """The whole table of a column is one part. All rows are divided by one number, so their ratios stay the same."""
     NONE = "none"
     """No part is divided. The codes represent the raw probabilities."""
 

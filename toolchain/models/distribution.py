@@ -141,7 +141,7 @@ class LabelType:
 
     @property
     def step(self) -> float:
-        """Difference between the numbers of adjacent names."""
+        """The number that stands for a name, minus the number that stands for the name before."""
         return self._numbers()[1]
 
     def _numbers(self) -> tuple[float, float]:

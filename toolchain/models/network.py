@@ -91,8 +91,8 @@ def network_model(
     """Return the network of a question; `symbols` are the joint distribution's symbols, in the machine's order.
 
     Raises:
-        ModelError: A factor has a number that is negative, infinite or NaN. A factor that is 0 everywhere once the
-            given values are fixed is also an error.
+        ModelError: A factor contains a number that is negative, infinite or NaN, or contains only zeros for the
+            values in `given`.
     """
     for factor in factors:
         if not np.all(np.isfinite(factor.table)) or np.any(factor.table < 0):

@@ -22,8 +22,8 @@ class Scanner:
     def __init__(self, data: bytes, path: Path, *, signs: str = "{}()[]|;,", comments: str) -> None:
         """Scan the bytes of a file.
 
-        Each character of `signs` is a token, and ends a word. `comments` is a regular expression for comments. It
-        matches only the beginning of a comment /* ... */.
+        Each character of `signs` is a token, and ends a word. `comments` is a regular expression that matches a
+        comment. For a comment between `/*` and `*/`, the expression matches only `/*`.
         """
         self._path = path
         try:

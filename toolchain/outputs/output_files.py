@@ -100,7 +100,7 @@ class OutputFiles:
     contents: dict[str, Iterable[bytes]]
     """The pieces of each file's content, by the file's path in the deployment. Pieces may be iterated only once."""
     own: re.Pattern[str]
-    """Pattern for the paths of this part's files in any build. Writing removes matching files not in `contents`."""
+    """Pattern of all paths that this part's files can have. Writing removes matching files not in `contents`."""
 
 
 _MEMORIES: Final = re.compile(

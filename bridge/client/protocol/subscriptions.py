@@ -210,7 +210,7 @@ class Subscriptions:
         return subscribed.numbers
 
     def has_left_out(self, topic: str) -> bool:
-        """Return whether the client leaves a topic out because its messages are too large for the connection."""
+        """Return whether `leave_out` was called for a topic, because a message was too large for the connection."""
         subscribed = self._subscribed.get(absolute(topic))
         return subscribed is not None and subscribed.left_out
 
