@@ -1,6 +1,6 @@
 -- ================================================================================================
 -- rosbayes: bm1_words
--- Stores words from the host, outputs the used words in parallel, and reports too large words.
+-- Stores words from the host, outputs all words that the machine uses, and reports too large words.
 -- MIT licence; datasheet: docs/hardware/bm1_words.md
 -- ================================================================================================
 

@@ -92,10 +92,11 @@ class Chains:
     def run(self, starts: Sequence[BM2Start]) -> tuple[ChainResult, ...]:
         """Run a frame of every chain to its stop.
 
-        The chains run together, which is faster, only if their starts differ in nothing but `state` and `bank`.
+        If the starts differ in more than `state` and `bank`, the chains run one by one, which is slower.
 
         Raises:
-            StartError: The numbers of starts and chains differ, or a start does not fit. No chain has run then.
+            StartError: The numbers of starts and chains differ, or a start does not fit. In this case, no chain has
+                run.
         """
         if len(starts) != len(self._machines):
             raise StartError(f"There are {len(starts)} starts for {len(self._machines)} chains.")
@@ -447,9 +448,10 @@ def run_in_step(  # noqa: PLR0915 - vectors are not passed to functions
 
     Return False as soon as `max_cycles` or `ops_timeout` may stop a chain. The results are then incomplete.
 
-    `numbers` contains random numbers. For each chain, it contains a block of consecutive cycles. `clock`, the fourth
-    of `vectors`, has three rows with one value per chain: the index in `numbers` of the chain's next cycle, the index
-    in `numbers` at which the chain's block ends, and the number of the first cycle in the block.
+    `numbers` is the flattened array [chains, CDEs, cycles] of random numbers. It contains a block of consecutive cycles
+    for each chain. `clock`, the fourth of `vectors`, has three rows with one value per chain: the index in `numbers` of
+    the first CDE's number for the chain's next cycle, the index at which the first CDE's numbers end, and the number of
+    the block's first cycle.
     """
     values, addresses, results, clock, room = vectors
     burn_in, samples, max_cycles, ops_timeout = limits

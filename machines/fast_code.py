@@ -84,9 +84,10 @@ def store_of_codes(occurring: npt.NDArray[np.bool_], slots: int) -> _Store:
 
 
 def store_of_frame(occurring: npt.NDArray[np.bool_], cells: int, slots: int) -> _Store:
-    """Allocate a store that holds the codes of one frame at a time. Every new frame assigns the rows to its own codes.
+    """Allocate a store for the words of one frame at a time.
 
-    The number of rows is the number of codes that may occur, but at most the number of cells.
+    A row holds the words of one code of a column. Every new frame assigns the rows to the codes that it uses. There is
+    a row for each code that may occur, but no more rows than cells, because a frame uses at most one code per cell.
     """
     none = np.zeros(min(int(occurring.sum()), cells), dtype=np.int64)
     return _store(np.full(occurring.shape, NO_ROW, dtype=np.int32), none, none, slots)

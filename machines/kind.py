@@ -99,7 +99,7 @@ class Inference(NamedTuple):
         posterior: The joint posterior, float64[all lines], or None if there is none. With replicas,
             float64[replicas * all lines]: the replicas' posteriors one after the other. A replica without a posterior
             has zeros. The value is None only if no replica has a posterior.
-        totals: The sum of the counts of each board.
+        totals: For each board, the sum of its counts.
         outcome: `posterior`, or the reason why the posterior is missing or biased.
         details: Further values for the report of the frame, by their keys.
         samples: The sampled states of the machine, concatenated. A machine without a stream has none.
@@ -133,7 +133,7 @@ class UsedRegisters:
         result_words: Number of words of the block RESULTS, for all replicas.
         written: The number of words of each block that a host may write, by the block's name. The block of inputs is
             not included.
-        answer: For the name of each block that a stopped board sends, the number of words. The blocks are in the
+        answer: The number of words of each block that a stopped board sends, by the block's name. The blocks are in the
             order of sending, and RESULTS is the first.
         capabilities: Values of capability registers (`CAP_LINES`) or of their fields (`CAP_MACHINE.KIND`), by name.
         size: The size of the machine, described for a user.

@@ -95,8 +95,8 @@ class Subscription(Handle):
 
     If the reader is too slow, the oldest messages are dropped. A slow reader does not affect the connection.
     The iteration continues after a lost connection. It ends when the subscription or the client is closed.
-    If a message is too large for the connection, the client leaves the topic out. Reading then raises a
-    `TopicLeftOutError`.
+    A message larger than `max_size` ends the connection. The client then connects again, without this topic. When all
+    queued messages have been read, reading raises a `TopicLeftOutError`.
 
     Attributes:
         topic: Name of the topic.

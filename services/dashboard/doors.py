@@ -40,7 +40,8 @@ class Doors:
 
     Args:
         app: The application that gets the admitted requests.
-        policy: The accepted tokens, and the other web pages that may connect.
+        policy: The accepted tokens, and the origins whose web pages may connect. The server's own pages may always
+            connect.
         loopback: Whether the server listens on loopback. Only this machine can then reach the server.
     """
 

@@ -76,7 +76,8 @@ class KeptFrame:
     def marginal(self, labels: tuple[str, ...]) -> "NDArray[np.float64]":
         """Return the marginal over one or two variables, with the axes in the order of `labels`.
 
-        The sum of the marginal is 1. If `labels` contains the replicas, the sum over all replicas together is 1.
+        The whole array sums to 1, also if one of `labels` is that of the replicas. The part of a single replica then
+        sums to less than 1.
         """
         if self.values is None:
             raise ValueError("a frame without a posterior has no marginal")

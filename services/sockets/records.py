@@ -228,7 +228,7 @@ class Published(Record, tag="published", frozen=True):
     """The publisher tells the master the outcome of a result.
 
     `seen` is True if the result came back from the server, and None if that was not checked. `best_line` is the number
-    of the most probable cell. `total_ns` is the time from the reading's receipt to the result's sending. If the result
+    of the most probable line. `total_ns` is the time from the reading's receipt to the result's sending. If the result
     was published on some outputs only, `missed` is the number of the other outputs. `out_ns` is the duration of
     publishing. If there is no posterior or a biased posterior, `why` is the sentence of the frame's report. `cause`
     lists the boards' stop reasons.

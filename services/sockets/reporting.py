@@ -96,7 +96,7 @@ class ServiceManager:
 class Report:
     """The status of a process, with its identity, rate, CPU time, memory and latencies.
 
-    `is_alive` returns whether the process makes progress. Omit `is_alive` if an answer of the process already proves
+    `is_alive` returns whether the process makes progress. Omit `is_alive` if the process can only answer while it makes
     progress. `stages` returns the latencies of the stages that a frame passes in the process.
     """
 

@@ -282,10 +282,10 @@ async def report_failure(link: Link, error: BaseException) -> None:
 
 
 def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None:
-    """Return an error that advises a restart, if the deployment's folder was rebuilt since this process loaded it.
+    """Return an error that advises a restart of this service, or None if a restart would not help.
 
-    `refused` is the first record of a refused master. Return None if the record is not a `Hello`, or if the folder
-    does not contain the deployment that the `Hello` names.
+    `refused` is the first record of a master that this service refused. A restart helps if the record is a `Hello`
+    that names another deployment than `deployment`, and this other deployment is now in the folder.
     """
     if not isinstance(refused, Hello) or refused.deployment_hash == deployment.hash:
         return None

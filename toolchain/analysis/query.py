@@ -177,9 +177,9 @@ class Contents:
     joint: JointDistribution
     searched: tuple[str, ...] = ()
     apart: Mapping[str, Sequence[str]]
-    """For each candidate for a known variable, the candidates that a BM1 cannot know together with it.
+    """For each candidate for a known variable, the candidates that cannot be known variables of the same BM1.
 
-    A BM1 cannot know two candidates together if they depend on each other given the searched variables.
+    Two candidates cannot both be known variables of a BM1 if they are dependent given the searched variables.
     """
 
     def as_json(self) -> str:

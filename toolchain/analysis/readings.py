@@ -201,13 +201,16 @@ def recorded_readings(
     tolerance_s: float = 0.1,
     in_sequence: bool = False,
 ) -> Readings:
-    """Return at most `frames` readings of a recording (CSV, MCAP or bag), spread over its length.
+    """Return at most `frames` readings of a recording (CSV, MCAP or bag).
 
-    With `in_sequence`, the readings come from the first `frames` rows. A row that does not fit the machine then counts
-    as a row without readings. Without `in_sequence`, a row that does not fit the machine is left out.
+    Without `in_sequence`, the rows are spread over the recording. A row that does not fit the machine is left out. With
+    `in_sequence`, the readings come from the first `frames` rows. A row that does not fit the machine then counts as a
+    row without readings.
 
-    `given` has NAME=COLUMN for each variable whose column has another name. A `*` in NAME and in COLUMN stands for
-    equal text. In a bag with several topics, the messages of one row may be up to `tolerance_s` apart.
+    If `given` is empty, each variable reads the column of its own name. Otherwise, `given` has NAME=COLUMN for each
+    variable that has a column. The readings of all other variables are missing. A `*` in COLUMN stands for the text
+    that matches the `*` in NAME. In a bag with several topics, the messages of one row may be up to `tolerance_s`
+    apart.
 
     Raises:
         ModelError: The recording or a column does not exist, or no row fits the machine.

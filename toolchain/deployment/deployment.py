@@ -208,7 +208,10 @@ class Deployment(DeploymentFile):
 
     @property
     def edited_boards(self) -> tuple[int, ...]:
-        """The boards with images from MIFs or parameters edited by hand. These images may differ from the model."""
+        """Indices of the boards whose images come from hand-edited files (MIFs or parameters).
+
+        These images may differ from the model.
+        """
         return tuple(index for index, board in enumerate(self.boards) if board.built_hash)
 
     def output_uri(self, output: Output) -> str:

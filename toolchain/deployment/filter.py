@@ -130,7 +130,7 @@ class Filter:
     def predict(self, steps: int = 1) -> NDArray[np.uint16]:
         """Advance the belief by `steps` frames, and return it as the codes of a prior: uint16[lines].
 
-        One call advances the belief by at most `most_steps` frames.
+        If `steps` is larger than `most_steps`, the belief advances by `most_steps` frames.
         """
         self.belief = self.transition.after(self.belief, min(steps, self.most_steps))
         return prediction_codes(self.belief, self._prob_bits)

@@ -246,7 +246,10 @@ class Links:
         return path[::-1]
 
     def lengths(self, start: str, ends: Sequence[str]) -> dict[str, int]:
-        """Return the number of symbols on the shortest path from `start` to each of `ends` that is connected to it."""
+        """Return the length of the shortest path from `start` to each symbol in `ends`.
+
+        A length is the number of symbols on the path, with both ends. Symbols without a path from `start` are left out.
+        """
         before = self._reached(start)
         count = {start: 1}
         for name in before:  # nearer ones are first

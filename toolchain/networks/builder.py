@@ -18,7 +18,7 @@ MAX_VARIABLES: Final = 20_000
 MAX_STATES: Final = 65_535
 """Maximum number of states of a variable, because a column of a machine can have at most 2^16 - 1 values."""
 MAX_PARENTS: Final = 30
-"""Maximum number of parents. NumPy arrays are limited to 64 axes, and tables to 2^24 entries."""
+"""Maximum number of parents, well below NumPy's limit of 64 axes. `MAX_ENTRIES` also limits the size of a table."""
 MAX_TOTAL: Final = 2 * MAX_ENTRIES
 """Maximum number of entries of all tables together."""
 MAX_NAME: Final = 200

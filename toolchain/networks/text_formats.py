@@ -22,8 +22,8 @@ class Scanner:
     def __init__(self, data: bytes, path: Path, *, signs: str = "{}()[]|;,", comments: str) -> None:
         """Scan the bytes of a file.
 
-        Each character of `signs` is a token, and ends a word. `comments` is a regular expression that matches a
-        comment. For a comment between `/*` and `*/`, the expression matches only `/*`.
+        Each character of `signs` is a token, and ends a word. `comments` is a regular expression that matches whole
+        comments, but only the opening `/*` of a comment between `/*` and `*/`. The scanner then finds the `*/`.
         """
         self._path = path
         try:

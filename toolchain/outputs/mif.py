@@ -27,7 +27,7 @@ MOST_WORDS: Final = 1 << 24
 """Maximum number of words in a memory. Without this limit, a short file could declare a memory of any depth."""
 
 MOST_WIDTH: Final = 1 << 20
-"""Maximum width of a word in bits. 4096 lines with codes of 16 bits need words of 65,536 bits."""
+"""Maximum width of a word in bits, far above the 65,536 bits that 4096 lines with codes of 16 bits need."""
 
 _BASES: Final = {"BIN": 2, "OCT": 8, "DEC": 10, "UNS": 10, "HEX": 16}
 _DECIMAL_DIGITS: Final = 4000  # Python refuses longer decimal numbers, because the time is quadratic
