@@ -136,7 +136,10 @@ class BM1Kind(MachineKind):
         return joint if joint is not StopReason.NONE else StopReason.SLICE
 
     def infer(self, results: Sequence[BoardResult], _: Sequence[str] = ()) -> Inference:
-        """Return the posterior over the lines of all boards, or one such posterior after the other for replicas."""
+        """Return the posterior over the lines of all boards.
+
+        With replicas, the posteriors of all replicas are returned in one array, one after the other.
+        """
         joint: npt.NDArray[np.float64] | None = None
         totals: list[int] = []
         if results and results[0].replica_cycles:

@@ -449,9 +449,9 @@ def run_in_step(  # noqa: PLR0915 - vectors are not passed to functions
     Return False as soon as `max_cycles` or `ops_timeout` may stop a chain. The results are then incomplete.
 
     `numbers` is the flattened array [chains, CDEs, cycles] of random numbers. It contains a block of consecutive cycles
-    for each chain. `clock`, the fourth of `vectors`, has three rows with one value per chain: the index in `numbers` of
-    the first CDE's number for the chain's next cycle, the index at which the first CDE's numbers end, and the number of
-    the block's first cycle.
+    for each chain. `clock` is the fourth of `vectors`. Each row of `clock` has one value per chain. Row 0 is the index
+    in `numbers` of the first CDE's next number. Row 1 is the index at which the first CDE's numbers end. Row 2 is the
+    number of the block's first cycle.
     """
     values, addresses, results, clock, room = vectors
     burn_in, samples, max_cycles, ops_timeout = limits

@@ -84,10 +84,10 @@ def store_of_codes(occurring: npt.NDArray[np.bool_], slots: int) -> _Store:
 
 
 def store_of_frame(occurring: npt.NDArray[np.bool_], cells: int, slots: int) -> _Store:
-    """Allocate a store for the words of one frame at a time.
+    """Allocate a store whose rows are assigned anew in every frame, to the codes that the frame uses.
 
-    A row holds the words of one code of a column. Every new frame assigns the rows to the codes that it uses. There is
-    a row for each code that may occur, but no more rows than cells, because a frame uses at most one code per cell.
+    A row holds the words of one code of a column. `cells` is the number of cells of all replicas. A frame uses at most
+    one code per cell, so the store needs at most `cells` rows. If fewer codes may occur, it has one row per such code.
     """
     none = np.zeros(min(int(occurring.sum()), cells), dtype=np.int64)
     return _store(np.full(occurring.shape, NO_ROW, dtype=np.int32), none, none, slots)

@@ -100,7 +100,7 @@ class Inference(NamedTuple):
             float64[replicas * all lines]: the replicas' posteriors one after the other. A replica without a posterior
             has zeros. The value is None only if no replica has a posterior.
         totals: For each board, the sum of its counts.
-        outcome: `posterior`, or the reason why the posterior is missing or biased.
+        outcome: The text `posterior`, or the reason why the posterior is missing or biased.
         details: Further values for the report of the frame, by their keys.
         samples: The sampled states of the machine, concatenated. A machine without a stream has none.
         sample_bytes: Length of each sampled state in bytes.

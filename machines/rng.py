@@ -76,7 +76,8 @@ class LFSR:
     """A Fibonacci linear feedback shift register of `bits` bits, at most 32.
 
     A step shifts the state left by one bit. Each exponent e >= 1 of the polynomial selects bit e - 1 of the state
-    before the step. The new lowest bit is the parity of the selected bits. The period is 2**bits - 1: the register runs through every state but 0.
+    before the step. The new lowest bit is the parity of the selected bits. The period is 2**bits - 1: the register runs
+    through every state but 0.
     """
 
     kind: RngKind

@@ -339,9 +339,9 @@ class Session:
         return f"; the largest so far was one of {largest}, with {size} bytes" if size else ""
 
     def why_left_out(self) -> str:
-        """Return the end of an error text that begins with the name of a topic.
+        """Return why the client no longer subscribes to a topic: a message was larger than `max_size`.
 
-        The text says why the client no longer subscribes to the topic: a message was larger than `max_size`.
+        The result is the rest of a sentence. The caller puts the name of the topic in front.
         """
         return (
             f"is left out: a message of it has more than the {self.core.wire.max_size} bytes (max_size) that this "

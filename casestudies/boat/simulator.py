@@ -120,7 +120,11 @@ class Boat:
         return SWITCHES[name][0 if on else 1]
 
     def sail(self, seconds: float) -> None:
-        """Move the boat for `seconds` along its waypoints, or at the velocity of `drive` if `sail` is off."""
+        """Move the boat for `seconds`.
+
+        If the switch `sail` is on, the boat follows its waypoints. If the switch is off, the boat moves at the velocity
+        of the last `drive`, for as long as this velocity holds.
+        """
         if not self.switches["sail"]:
             driven = min(seconds, self._driven)
             self._driven -= driven

@@ -76,8 +76,8 @@ class KeptFrame:
     def marginal(self, labels: tuple[str, ...]) -> "NDArray[np.float64]":
         """Return the marginal over one or two variables, with the axes in the order of `labels`.
 
-        The whole array sums to 1, also if one of `labels` is that of the replicas. The part of a single replica then
-        sums to less than 1.
+        One of `labels` may be `replica`. The whole array still sums to 1, so the part of a single replica sums to less
+        than 1.
         """
         if self.values is None:
             raise ValueError("a frame without a posterior has no marginal")

@@ -35,11 +35,11 @@ _WORK: Final = 2**27
 def agreement(
     machine: BM2Machine, bit: int, values: Mapping[int, NDArray[np.int64]]
 ) -> list[tuple[int, NDArray[np.float64]]]:
-    """Return an item for each CDE whose factor contains the state bit `bit`.
+    """Return each CDE whose factor contains the state bit `bit`, with its probabilities of a 1.
 
-    An item is the index of the CDE, and the probability in each state that the CDE draws 1 for `bit`, float64[states].
-    The keys of `values` are the other bits of these factors. A bit's entry is the bit's value in each state,
-    int64[states].
+    An item has the index of a CDE, and an array float64[states]. For each state, the array has the probability that
+    the CDE draws 1 for `bit`. `values` has an array int64[states] for each other bit of these factors. For each state,
+    the array has the value of this other bit.
     """
     p, found = machine.parameters, []
     variable = next(at for at, mask in enumerate(p.masks) if mask >> bit & 1)

@@ -94,9 +94,9 @@ class Of(StrEnum):
     STEP = "step"
     """A step of an LFSR in a cycle, in bm1_lfsr. Its logic computes the parity of the taps."""
     PLACE_BIT = "place bit"
-    """A bit of the index in bm1_table_player. The index selects the current random number in a table.
+    """A bit of the index in bm1_table_player. The index is the place of the current random number in the table.
 
-    The logic of the bit computes the same bit of the next index.
+    The logic of the bit computes the bit's value in the next index.
     """
     WORD = "word"
     """A word that the host writes for a frame, in bm1_words. Its logic decodes the address and checks the value."""

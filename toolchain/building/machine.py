@@ -251,10 +251,11 @@ def fitted_layout(
     what: str,
     advice: str = "",
 ) -> BoardLayout:
-    """Return the layout in which each board has its block of `blocks`. All boards have an equally large interface.
+    """Return the layout of the boards. All boards have an equally large interface.
 
-    `used` are the registers that the largest board needs. `asked` is the size of the interface (inputs, results), or
-    None for the size that `used` needs.
+    `blocks` has the lines of each board. `used` are the registers that the largest board needs. `asked` is the size of
+    the interface of every board: the numbers of input words and result words. If `asked` is None, the interface is as
+    large as `used` requires.
 
     Raises a BuildError if `used` exceeds the interface or the register map, or if the interface exceeds the register
     map. `what` describes the largest board in the error. If `used` exceeds the register map, the error ends with

@@ -141,7 +141,7 @@ class LabelType:
 
     @property
     def step(self) -> float:
-        """The number that stands for a name, minus the number that stands for the name before."""
+        """The difference from each name's number to the next name's number. It is negative if the numbers fall."""
         return self._numbers()[1]
 
     def _numbers(self) -> tuple[float, float]:

@@ -88,7 +88,9 @@ def network_model(
     known: Sequence[Symbol],
     given: Mapping[str, int],
 ) -> NetworkModel:
-    """Return the network of a question; `symbols` are the joint distribution's symbols, in the machine's order.
+    """Return the network of P(searched | known), with the variables in `given` fixed at their values.
+
+    `symbols` are the variables of the joint distribution. The machine has its variables in the same order.
 
     Raises:
         ModelError: A factor contains a number that is negative, infinite or NaN, or contains only zeros for the

@@ -22,8 +22,8 @@ class Scanner:
     def __init__(self, data: bytes, path: Path, *, signs: str = "{}()[]|;,", comments: str) -> None:
         """Scan the bytes of a file.
 
-        Each character of `signs` is a token, and ends a word. `comments` is a regular expression that matches whole
-        comments, but only the opening `/*` of a comment between `/*` and `*/`. The scanner then finds the `*/`.
+        Each character of `signs` is a token, and ends a word. `comments` is a regular expression that matches a whole
+        comment. If a comment begins with `/*`, the expression matches only the `/*`, and the scanner finds the `*/`.
         """
         self._path = path
         try:
