@@ -307,9 +307,10 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
     Return False, before the chains are finished, if `max_cycles` or the timeout of the OPS may stop a chain too early.
 
     `vectors` contains `numbers`, `values`, `pointed`, `counts` and `room`. `counts` has a counter for each joint value
-    of the unknown bits. The counter of a joint value counts the samples with this value. The exception is the
-    counter of value 0: it counts sweeps, and overflows at the end of the burn-in and at the end of the chain.
-    `room` is working space for carries, for the bits of contexts, and for the events of a sample.
+    of the unknown bits. A counter counts the samples with its value, except counter 0, which counts sweeps. Counter 0
+    first counts from -burn_in up to 0, and then from -samples up to 0. The caller computes the number of samples with
+    value 0 from the other counters. `room` is working space for carries, for the bits of contexts, and for the events
+    of a sample.
     """
     numbers, values, pointed, counts, room = vectors
     burn_in, samples, max_cycles, window, steps = limits

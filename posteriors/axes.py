@@ -1,4 +1,4 @@
-"""The dimensions of posteriors with their units and states, and texts for cells."""
+"""The axes of a posterior, with their units and states. An axis formats cells and sampled states as text."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -73,7 +73,10 @@ def status_directory(given: Path | None, name: str) -> Path | None:
 
 
 class LockedRunDirectory:
-    """The run directory of a master that starts processes, locked until `release` and until its children end."""
+    """The run directory of a master that starts processes.
+
+    The directory is locked until `release` is called and all children of the master have ended.
+    """
 
     def __init__(self, given: Path | None) -> None:
         """Lock the directory.

@@ -26,7 +26,7 @@ _PIECE: Final = 1 << 18
 
 @contextmanager
 def file_errors(path: Path, done: str, error: type[ToolchainError], advice: str = "") -> Iterator[None]:
-    """Convert an OSError in the block to `error`. `done` says what failed: the file cannot be "read" or "written"."""
+    """Convert an OSError in the block to `error`: "PATH cannot be DONE". `done` is "read" or "written", for example."""
     try:
         yield
     except OSError as reason:

@@ -198,7 +198,7 @@ def with_arrays(value: Any) -> Any:
     """In a message that arrived as JSON, replace every list of numbers by an array, in place.
 
     A list with a float becomes float64, and null becomes NaN. A list of integers becomes int64, or uint64 if int64 is
-    too small. Bytes become uint8. All other lists, including numbers mixed with booleans, remain lists.
+    too small. All other lists remain lists, for example lists with booleans. A `uint8[]` remains base64 text.
     """
     import numpy as np
 

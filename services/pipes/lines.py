@@ -1,5 +1,4 @@
-"""Reading of lines of limited length from standard input, and the contents of lines in pipes between commands.
-
+"""Pipes between commands: lines of limited length from standard input, and the JSON objects that the lines contain.
 `terminal.output.print_json_line` writes lines to standard output.
 """
 

@@ -147,7 +147,10 @@ class ExactChain:
         return searched_values(self._parameters, words)
 
     def posterior(self, law: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the posterior of the searched variables' joint values, float64[values], for a law of the states."""
+        """Return the posterior of the searched variables' joint values, float64[values].
+
+        `law` is the distribution of the chain's state, float64[states].
+        """
         p, used = self._parameters, self._searched >= 0
         size = int(np.prod([p.cardinalities[variable] for variable in p.searched]))
         found = np.bincount(self._searched[used], law[used], size)
@@ -189,13 +192,16 @@ class ChainError:
     share: float
     """The total probability of the examined readings. The most probable readings are examined."""
     quantising: float
-    """Mean distance between the stationary law's posterior and exact inference, over the examined readings."""
+    """Mean distance between the posterior of long runs and exact inference, over the examined readings.
+
+    Quantised and clipped codes cause this distance.
+    """
     worst: float
-    """Largest distance between the stationary law's posterior and exact inference, over the examined readings."""
+    """Largest distance between the posterior of long runs and exact inference, over the examined readings."""
     worst_reading: tuple[int, ...]
     """The reading with the distance `worst`: one address per known variable."""
     start: float
-    """Mean distance between a frame's expected posterior and the stationary law's posterior.
+    """Mean distance between a frame's expected posterior and the posterior of long runs.
 
     The start state causes this distance.
     """

@@ -119,9 +119,9 @@ def readings_of_lines(
 ) -> Readings:
     """Convert drawn readings for a machine whose lines have their own readings.
 
-    The cell of the true line reads the drawn value. The model does not define the readings of the other lines.
-    Their readings are drawn from the mean distribution over all lines. With sensor_mode `threshold`, the result also
-    contains the likelihoods as codes.
+    The cell of the true line reads the drawn value. The model does not define the readings of the other lines. These
+    readings are drawn from P(K), the distribution of the reading without a known line. With sensor_mode `threshold`,
+    the result also contains the likelihoods as codes.
 
     Raises:
         BuildError: The true lines of `drawn` are unknown, because its readings were not drawn from a model.

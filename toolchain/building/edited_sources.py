@@ -1,7 +1,7 @@
 """Building of images (programming files) from edited sources of a deployment (thesis 3.2, 3.4).
 
-The sources are MIFs and `bm1_parameters.vhd`. An edit is accepted if sources written from the new images equal the
-edited sources. Edited sources that contradict each other are thus refused.
+The sources are MIFs and `bm1_parameters.vhd`. To find contradictions between edited sources, the toolchain writes the
+sources again from the new images. An edit is accepted only if these sources equal the edited sources.
 """
 
 from collections.abc import Callable, Sequence

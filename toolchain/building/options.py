@@ -163,9 +163,9 @@ FILL: Final = 0
 
 
 def replica_count(text: str) -> int:
-    """Return the number that the value of `--replicas` means, or FILL for `fill`.
+    """Return the number in the value of `--replicas`, or FILL for `fill`.
 
-    Click passes the default as a number, not as text.
+    If the flag is not given, Click passes the default, which is an int instead of a text.
     """
     if text == "fill":
         return FILL

@@ -170,7 +170,10 @@ class Relation:
     """Bits whose XOR is 0 in every cycle."""
 
     group: int
-    """Index of the bank of seeds. With a generator per cell, bank * lines + line."""
+    """Index of the group of columns. A group is a bank of seeds.
+
+    If each cell has its own generator, a group is a line of a bank, and its index is bank * lines + line.
+    """
     bits: tuple[Bit, ...]
 
 

@@ -78,7 +78,7 @@ def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int, replicas: int
 
 
 MISSING: Final = -1
-"""Address of a missing reading, used for all lines of a machine."""
+"""The value that stands for the address of a missing reading."""
 
 
 def to_addresses(deployment: Deployment, variable: Variable, value: object) -> list[int] | None:

@@ -77,9 +77,9 @@ class Support:
 
 
 def locate(model: Model, columns: Mapping[str, Sequence[object]], rows: int) -> TrueCells:
-    """Find the usable rows among `rows` rows, and the true position in each of the usable rows.
+    """Find the rows whose true position is on the grid, and these positions.
 
-    `columns` contains a column of true values for the label of each searched dimension.
+    `columns` has, by label, a column of true values for each searched dimension. `rows` is the number of rows.
     """
     places = np.array(
         [[_position(dimension, value) for value in columns[dimension.label]] for dimension in model.searched]

@@ -284,7 +284,7 @@ class Question:
     def dependent(self) -> list[tuple[str, str]]:
         """Return the pairs of known symbols that are dependent given the searched symbols.
 
-        A BM1 can know only one symbol of a pair.
+        Only one symbol of a pair can be known in a BM1.
         """
         factors, pairs = self._pairs()
         return [

@@ -128,9 +128,9 @@ _UNKNOWN: Final = _Known(b"\xff", 0, "", _Subscribed("", None, _DEFAULT, "", sys
 class Subscriptions:
     """All subscriptions of a client.
 
-    Receiving messages is the client's busiest path. An envelope is the bytes of an operation before the message. If the
-    envelope is known from an earlier message, `receive_known` handles the message. `receive` handles all other
-    messages, after parsing.
+    Receiving messages is the client's busiest path. A received publish operation contains a ROS message. The bytes
+    before the ROS message are the envelope. If the client knows the envelope from an earlier message, `receive_known`
+    handles the message. `receive` parses and handles all other messages.
     """
 
     def __init__(self, wire: Wire) -> None:
