@@ -118,9 +118,9 @@ class Field:
 
 
 def all_missing(fields: Sequence[Field], message: dict[str, Any]) -> FieldMissingError:
-    """Return the error for a message that lacks these variables.
+    """Return the error for a message that has none of `fields`.
 
-    The error names the variables, at most `MAX_LISTED` of them, and lists the fields of the message.
+    The error names at most `MAX_LISTED` of `fields`, and lists the fields that the message has.
     """
     first, *others = fields
     if not others:

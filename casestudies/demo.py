@@ -51,7 +51,7 @@ class Case:
     viewing: Sequence[str] = ()
     """Options of the viewer."""
     publishers: Mapping[str, Sequence[str]]
-    """Options of each command on the robot's side, in the order in which the commands are started."""
+    """The commands that act as the robot, each with its options, in the order in which they are started."""
     counts_frames: bool = True
     """True if the viewer shows every frame of the master. The demo then passes `--count` to the master as well."""
 

@@ -62,7 +62,11 @@ class Readiness:
 
 @contextlib.asynccontextmanager
 async def connected(name: str, work: str, uri: str) -> AsyncIterator[tuple[Ros, Readiness]]:
-    """Within the context, connect to a server, and report in the run directory how recently `work` was done."""
+    """Connect to a server, and yield the connection and the `Readiness` of this process.
+
+    Until the end of the context, the process `name` answers health checks through a socket in the run directory. The
+    answer says how recently `work` was done. The caller calls `Readiness.record` each time.
+    """
     started, readiness = time.monotonic(), Readiness(work)
 
     def answer() -> bytes:
@@ -101,7 +105,7 @@ async def report_refused(
 ) -> None:
     """Warn if rosapi does not list an advertised topic, or lists the topic with another type.
 
-    The warning advises the user to install the message package, or else to do what `otherwise` says.
+    The warning advises the user to install the message package on the robot, or to follow the advice `otherwise`.
     """
     await asyncio.sleep(SETTLED_S)
     known = await ros.topic_type(topic)

@@ -59,7 +59,7 @@ class BM2StopReason(IntEnum):
     NONE = 0
     """The machine has not run since the reset."""
     SAMPLES = 1
-    """All samples are drawn. A resumed run draws more samples."""
+    """The machine has drawn all requested samples. A host can resume the run with a higher number of samples."""
     MAX_CYCLES = 2
     """The machine reached the frame's maximum number of cycles before it had drawn all samples."""
     PAUSED = 3

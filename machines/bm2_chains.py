@@ -304,7 +304,8 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
 ) -> bool:
     """Run bit-sliced chains until each has drawn its samples, and store the number of cycles of each chain in `ends`.
 
-    Return False, before the chains are finished, if `max_cycles` or the timeout of the OPS may stop a chain too early.
+    Return True if all chains have finished. Return False, with unfinished chains, if `max_cycles` or the timeout of
+    the OPS may stop a chain before its last sample.
 
     `vectors` contains `numbers`, `values`, `pointed`, `counts` and `room`. `counts` has a counter for each joint value
     of the unknown bits. A counter counts the samples with its value, except counter 0, which counts sweeps. Counter 0

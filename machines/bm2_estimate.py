@@ -75,9 +75,9 @@ def searched_counts(parameters: BM2Parameters, results: npt.NDArray[np.integer])
 
 
 def searched_values(parameters: BM2Parameters, stream: npt.NDArray[np.uint32]) -> npt.NDArray[np.int64]:
-    """Return for each state the index of the searched joint value, or -1 if the state has an unused code.
+    """Return for each state in `stream` the index of the searched variables' joint value: int64[samples].
 
-    The states are uint32[samples, state_words].
+    `stream` is uint32[samples, state_words]. If a code in a state stands for no value, the index is -1.
     """
     codes = unpack_all(parameters.cardinalities, stream)
     values = np.zeros(len(stream), dtype=np.int64)
@@ -89,9 +89,10 @@ def searched_values(parameters: BM2Parameters, stream: npt.NDArray[np.uint32]) -
 def estimate(chains: Sequence[BoardSamples]) -> ChainEstimate:
     """Return the estimate of the posterior from the chains of all boards.
 
-    A board is left out if it timed out or has no sample. The counts of the remaining boards are added, because each
-    board has drawn the same number of samples. If a board reached its maximum number of cycles, the numbers may differ.
-    Then each board's counts are divided by their sum, which gives every board the same weight.
+    A board is left out if it timed out or has no sample. The counts of the remaining boards are added. Normally, all
+    boards have drawn the same number of samples, and thus have the same weight. If a board reached its maximum number
+    of cycles, the numbers of samples may differ. Then each board's counts are divided by their sum before they are
+    added, so that all boards still have the same weight.
     """
     left_out = tuple(
         board

@@ -334,7 +334,9 @@ class _OnBoard(BoardMachine):
 
 
 class Kept(msgspec.Struct, array_like=True):
-    """The record of one board's chain in a frame, in addition to the last result words of the board.
+    """The results of one board's chain in a frame, without the last result words.
+
+    The last result words are in `BoardResult.words`.
 
     Attributes:
         samples: Number of samples drawn so far.

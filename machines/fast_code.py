@@ -76,7 +76,7 @@ class _Frame(NamedTuple):
 
 
 def store_of_codes(occurring: npt.NDArray[np.bool_], slots: int) -> _Store:
-    """Allocate a store with a row for each code that may occur. The words are not computed yet."""
+    """Allocate a store with an empty row for each code that may occur."""
     row_of_code = np.full(occurring.shape, NO_ROW, dtype=np.int32)
     row_column, row_code = np.nonzero(occurring)
     row_of_code[occurring] = np.arange(len(row_code), dtype=np.int32)
@@ -112,7 +112,7 @@ def _store(
 
 
 def make_frame(parameters: BM1Parameters, rows: int) -> _Frame:
-    """Allocate a frame of all replicas."""
+    """Allocate the arrays for a frame of all replicas. `rows` is the number of rows in the `_Store`."""
     replicas, lines, columns = parameters.replicas, parameters.lines, parameters.columns
     return _Frame(
         lines=np.zeros((replicas, lines), dtype=np.int64),

@@ -291,7 +291,10 @@ class MachineKind(ABC):
 
     @abstractmethod
     def contents(self, machine: Any) -> Blocks:
-        """Return the words that the registers have after an image is loaded, without `UsedRegisters.capabilities`."""
+        """Return the initial words of the register blocks after an image is loaded.
+
+        The registers in `UsedRegisters.capabilities` are not included.
+        """
 
     @abstractmethod
     def kernel(self, machine: Any) -> Any:

@@ -112,8 +112,8 @@ class BM1Parameters:
         sensor_mode: `column`, `cell` or `threshold`. With `column`, each sensor column has one address. With `cell`,
             each cell has its own address. With `threshold`, each cell has a code as its input, without a table. The
             `sensor_bits` of each column then equal `prob_bits`.
-        replicas: Number of machines that share the generators. Each machine has its own inputs, counters, stop and
-            cycles.
+        replicas: Number of machines that share the generators. Each machine has its own inputs, counters, stop reason
+            and number of cycles.
 
     Raises:
         ParameterError: A machine with these parameters cannot be built.

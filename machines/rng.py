@@ -84,7 +84,7 @@ class LFSR:
 
     @property
     def bits(self) -> int:
-        """Bits of the state."""
+        """Width of the state in bits."""
         return POLYNOMIALS[self.kind][0]
 
     @property

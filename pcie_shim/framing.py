@@ -21,7 +21,7 @@ GREET: Final = 1
 READ: Final = 2
 """Host to board: read `count` words, starting at `address`. The reply contains the words."""
 WRITE: Final = 3
-"""Host to board: write the payload from `address` on. The board acknowledges a WRITE without the flag POSTED."""
+"""Host to board: write the payload, starting at `address`. The board acknowledges a WRITE without the flag POSTED."""
 IRQ: Final = 4
 """Board to host: the machine has stopped.
 
@@ -80,7 +80,7 @@ class Frame(NamedTuple):
 def encode(
     operation: int, flags: int, sequence: int, address: int, count: int, payload: Octets = b""
 ) -> bytes:
-    """Return the bytes of a frame. `payload` has `count` words, or is empty."""
+    """Return the bytes of a frame. If the frame has a payload, the payload has `count` words."""
     head = _HEAD.pack(_MAGIC, operation, flags, sequence, address, count)
     return b"".join((head, _CRC.pack(crc32(payload, crc32(head))), payload))
 

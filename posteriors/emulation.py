@@ -39,13 +39,14 @@ class EmulatedPosterior(Posterior):
             model: The model from which the deployment was built. It is a folder with `model.py`, a network file, or a
                 `Model` or `Question`. If `model` is None, the function uses the codes in the memories of a BM1. These
                 codes are the quantised probabilities of the model. A BM2 needs a model.
-            settings: Parameters of `model()`, with the values of `toolchain build --set`.
+            settings: Arguments of the function `model` in `model.py`: the values that the build got with `--set`.
 
         Returns:
             The posterior. `details["exact"]` is `model`, or `codes` if the codes in the memories were used.
 
         Raises:
-            PosteriorError: `model` is None, and the machine is a BM2 or there are settings.
+            PosteriorError: `model` is None, but the machine is a BM2. Or `settings` are given, but `model` is None or
+                a network file.
             ToolchainError: The model has an error, or the deployment was not built from the model.
         """
         from toolchain.analysis.emulation import joined
@@ -133,8 +134,8 @@ def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int =
 
     Raises:
         LabelError: The deployment has no variable with a name in `readings`.
-        PosteriorError: `readings` is not a mapping. The error is also raised if the machine has replicas, or a
-            reading for each line. Use `machines.posterior` for such a machine.
+        PosteriorError: `readings` is not a mapping. The error is also raised if the machine has replicas, or if a
+            sensor's reading has one number per line. Use `machines.posterior` for such a machine.
         ToolchainError: The deployment is damaged, or a reading cannot be used.
         NoPosteriorError: All counts are 0 for these readings.
     """

@@ -45,8 +45,8 @@ class Posterior:
     probabilities: tuple[float, ...]
     """Probabilities of all cells, in row-major order over the dimensions of `labels`.
 
-    The sum is 1. If the first label is `replica`, the posteriors of all replicas follow each other, and
-    each of them sums to 1. If all counts of a replica are 0, its probabilities are 0.
+    Without replicas, the sum is 1. With replicas, the first label is `replica`, and the posteriors of the replicas
+    follow each other. The sum of each replica's posterior is 1, or 0 if all counts of the replica are 0.
     """
     labels: tuple[str, ...]
     """Names of the dimensions: those of the searched variables, after `replica` if there are several replicas."""
@@ -175,10 +175,10 @@ class Posterior:
         return dict(zip(self.labels, reversed(indices), strict=True))
 
     def mean(self) -> dict[str, float]:
-        """Return the mean index of each label, from 0.
+        """Return the mean index of each label. Indices start at 0.
 
-        The value of an index is `offset + index * step` (`deployment.toml`). This is linear, so the mean index
-        gives the mean value. The mean of a periodic variable, such as a heading, is not meaningful.
+        An index stands for the value `offset + index * step` (`deployment.toml`), so the mean index gives the mean
+        value. The mean of a periodic variable, such as a heading, is not meaningful.
         """
         means: dict[str, float] = {}
         for label, size in zip(self.labels, self.sizes, strict=True):

@@ -42,7 +42,8 @@ class CommandLine(typer.Typer):
     def add_later(self, name: str, module: str, *, purpose: str) -> None:
         """Add a subcommand whose module is imported only when a user names the subcommand.
 
-        The subcommand is the module's command line `app`. If `app` is a group, `MODULE:NAME` adds one command of `app`.
+        Each module defines its command line as `app`. If `module` is `MODULE`, the subcommand is the whole `app`. If
+        `module` is `MODULE:NAME`, the subcommand is only the subcommand NAME of `app`.
         """
         module, _, part = module.partition(":")
 

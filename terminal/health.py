@@ -2,8 +2,8 @@
 
 A process listens on `NAME.status.sock` in the run directory. Only the user of the process can access the socket
 (mode 0600). Each client receives one JSON object with at least `ready` and `why`. The process reads nothing, and
-closes the connection. Because health checks run every few seconds, this module imports only the standard library.
-Only a server imports asyncio.
+closes the connection. Health checks run every few seconds, so the import of this module must be fast. It imports only
+the standard library. Only the process that answers at a status socket also imports asyncio.
 """
 
 from __future__ import annotations

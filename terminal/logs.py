@@ -133,7 +133,11 @@ def _write(text: str) -> None:
 
 
 class Logger:
-    """The log of a process, without lines below a level. Fields with names that begin with `_` are only in JSON."""
+    """The log of a process. Messages below the process's level are not logged.
+
+    The keyword arguments of a message are its fields. A field whose name begins with `_` is only in JSON logs, where
+    the name has no `_`.
+    """
 
     def __init__(self, role: str, level: str) -> None:
         self._role = role

@@ -95,13 +95,13 @@ class Subscription(Handle):
 
     If the reader is too slow, the oldest messages are dropped. A slow reader does not affect the connection.
     The iteration continues after a lost connection. It ends when the subscription or the client is closed.
-    A message larger than `max_size` ends the connection. The client then connects again, without this topic. When all
-    queued messages have been read, reading raises a `TopicLeftOutError`.
+    A message larger than the client's `max_size` ends the connection. The client then connects again, but does not
+    subscribe to the topic again. When all queued messages have been read, reading raises a `TopicLeftOutError`.
 
     Attributes:
         topic: Name of the topic.
         lost: Number of messages dropped because the queue was full.
-        discarded: Number of messages discarded because they were larger than `max_bytes`.
+        discarded: Number of messages discarded because they were larger than the subscription's `max_bytes`.
         blind_seconds: Total time in which messages may have been missed. After each lost connection, this time
             lasts from the last data until the client subscribes to the topic again.
     """

@@ -69,7 +69,7 @@ class Ros:
             await self._session.close()
 
     def together(self) -> AbstractContextManager[None]:
-        """Send everything that is published inside the block together at its end: `with ros.together(): ...`.
+        """Collect the messages published in a block `with ros.together():`. Send them all when the block ends.
 
         Messages that belong together then wake up the server only once. Nothing is sent before the block ends, so the
         block should not wait for anything.

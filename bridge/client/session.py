@@ -50,7 +50,7 @@ ATTEMPT_TIMEOUT: Final = 5.0
 STEADY: Final = 5.0
 """A connection that lasts this many seconds resets the delay of the next reconnection to `FIRST_DELAY`."""
 SILENCE: Final = 2.0
-"""A subscription is checked if it has had no message after this many seconds."""
+"""If a subscription gets no message within this many seconds, the client checks whether it must subscribe again."""
 LONGEST_SILENCE: Final = 30.0
 """Maximum delay in seconds between two checks of silent subscriptions. The delay begins at `SILENCE` and doubles."""
 _ROSAPI_TIMEOUT: Final = 1.0
@@ -453,7 +453,7 @@ class Session:
     def send_now(self, data: bytes) -> None:
         """Write a message to the socket.
 
-        Call `must_wait` or `wait_turn` before, without an `await` between the two calls.
+        Call `must_wait` or `wait_turn` first. Do not `await` anything between that call and `send_now`.
         """
         (self._websocket or self._connected()).send((data,))
         if len(data) > self._largest_sent:  # noqa: PLR1730 - `max` takes ten times as long
@@ -486,7 +486,10 @@ class Session:
             self._waiting -= 1
 
     def flush(self) -> None:
-        """Send the core's output without waiting. The output is small and rare unless a server floods the client."""
+        """Send the messages in the core's outbox without waiting.
+
+        If the server leaves too many of these bytes unread, the connection is aborted.
+        """
         for message in self.core.data_to_send():
             websocket = self._websocket
             if websocket is not None and self.is_open:

@@ -218,7 +218,11 @@ class Calls(_Exchange):
         rosapi: Rosapi,
         answer_here: Callable[[Client, str], dict[str, Any] | None],
     ) -> None:
-        """Start without services. `answer_here` answers services of the hub itself, and returns None for others."""
+        """Start without services.
+
+        If no client offers a called service, the hub calls `answer_here` with the caller and the service's name.
+        `answer_here` returns the answer, or None if the service does not exist.
+        """
         super().__init__(limits, dispatcher, definitions, graph.services, lambda client: client.services)
         self._graph = graph
         self._rosapi = rosapi

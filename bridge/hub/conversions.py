@@ -174,9 +174,10 @@ def _numbers(values: Any, element: str, length: int, place: str) -> list[Any] | 
 def cbor_encoder(
     store: "Typestore", name: str, defaults: Callable[[str], dict[str, Any]], known: dict[str, Encode | None]
 ) -> Encode | None:
-    """Return a function that encodes a message with typed arrays, or None if no field has an array of numbers.
+    """Return a function that encodes messages of the type `name` as CBOR, with arrays of numbers as typed arrays.
 
-    `defaults` returns the default values of a type's fields. `known` stores the functions of nested message types.
+    If neither the type nor a nested type has an array of numbers, return None. `defaults` returns the default values
+    of a type's fields. `known` stores the functions of nested message types.
     """
     encoders: dict[str, Encode] = {}
 

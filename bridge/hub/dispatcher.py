@@ -90,7 +90,7 @@ class Dispatcher:
             self.schedule(deadline)
 
     def release(self, now: float) -> float:
-        """Queue the messages that throttles admit at `now`. Returns the time of the next admission, or infinity."""
+        """Queue the throttled messages that are due at `now`. Returns the next time to call `release`, or infinity."""
         for client in [client for client in self.throttled if client.outbox.deadline <= now]:
             client.outbox.release(now)
             self.mark_ready(client)

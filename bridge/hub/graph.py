@@ -147,7 +147,10 @@ class Offer:
     type: str
     client: Client
     fillers: Mapping[str, Filler]
-    """Fillers of absent fields, by the part of the type, such as `Request`. Empty if the type is unknown."""
+    """A filler of absent fields for each part of the type, by the part's name, such as `Request`.
+
+    If the type is unknown, there are no fillers.
+    """
 
 
 class Graph:

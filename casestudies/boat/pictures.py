@@ -203,8 +203,8 @@ def draw_shares(
 ) -> None:
     """Draw figure 4.5: the mean time of each stage, and its share of a frame's time.
 
-    `note` is appended to the label of the time axis. The legend shows the share of each kind of stage. For comparison,
-    it also shows the thesis's shares that `beside` contains. Raises an OutputError if the file cannot be written.
+    `note` is appended to the label of the time axis. The legend shows the share of each kind of stage. If `beside` has
+    the thesis's share of a kind, the legend shows that share too. Raises an OutputError if the file cannot be written.
     """
     figure = new_figure(8.4, 1.5 + 0.42 * max(len(shares), 1))
     axes = figure.subplots()

@@ -123,7 +123,7 @@ class Boat:
         """Move the boat for `seconds`.
 
         If the switch `sail` is on, the boat follows its waypoints. If the switch is off, the boat moves at the velocity
-        of the last `drive`, for as long as this velocity holds.
+        of the last `drive`, for at most `DRIVE_TIMEOUT` seconds after that `drive`.
         """
         if not self.switches["sail"]:
             driven = min(seconds, self._driven)

@@ -122,7 +122,7 @@ class BoatViewer:
         self.results = 0
 
     def add(self, instance: "Instance") -> str:
-        """Add a frame and return its line."""
+        """Add a frame, and return the line to print for the frame."""
         self.instances.append(instance)
         self.numbers.append(numbers_of(instance))
         self.frames += 1
@@ -196,7 +196,10 @@ class BoatViewer:
         return tuple(written)
 
     def medians(self) -> tuple[float | None, float | None]:
-        """Return the median distance in cells and the median time of a frame in ms. An unknown median is None."""
+        """Return the medians of `distance_cells` (see `numbers_of`) and of a frame's time in ms.
+
+        A median of no values is None.
+        """
         distances, times = (
             [each[key] for each in self.numbers if each[key] is not None]
             for key in ("distance_cells", "time_ms")

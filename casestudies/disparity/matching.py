@@ -18,7 +18,10 @@ nearly independent, as naive fusion assumes.
 SCALES: Final = (2.0, 2.0, 4.0)
 """Mean matching cost of each filter at the true disparity, in grey levels."""
 OUTLIER: Final = 0.05
-"""Minimum likelihood of a cost, for occlusions and reflections, relative to the likelihood of cost 0."""
+"""Minimum likelihood of a cost, relative to the likelihood of cost 0.
+
+Without this minimum, an occlusion or a reflection could rule out the true disparity.
+"""
 WINDOW: Final = 2
 """Number of pixels from the centre to the edge of the window in which costs are averaged."""
 

@@ -140,8 +140,8 @@ async def play(
     """Publish each frame, wait for its result before the next one, and return the played frames in order.
 
     A frame's stamp is the time of publication, and the frame's result has this stamp too. The first frame is
-    published every second until its result arrives, because the master may not have subscribed yet. Every other
-    frame is published once, and counts as lost after `timeout_s`.
+    published every second until its result arrives, because the master may not have subscribed yet. The later frames
+    are published only once each. A later frame without a result after `timeout_s` counts as lost.
 
     Raises:
         NoResultError: The first frame had no result.

@@ -20,8 +20,10 @@ def program(
     """Program the board whose registers are at `endpoint`, and return the image hash that the board then reports.
 
     The file and the board's register map are checked before the board is changed. Connecting, transferring the file
-    and loading the machine may each take `timeout` seconds. If this host has a link to the board, `token` is the token
-    in the link's greeting.
+    and loading the machine may each take `timeout` seconds.
+
+    If this host has a link to the board, `token` must be the token in the link's greeting. The token proves that this
+    host is the one that holds the board. Without a link, omit `token`.
 
     Raises:
         ImageError: The file is missing, damaged, or for another register map.

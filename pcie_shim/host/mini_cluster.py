@@ -133,7 +133,8 @@ class MiniCluster:
             endpoints: The boards, in the order of the partition.
             images: The image of each board.
             timeout: Maximum time in seconds until a board listens, and until a board answers a request.
-            slack: Number of seconds that a frame may take in addition to its cycles at the boards' measured speed.
+            slack: Number of seconds added to the time limit of each slice of a frame. The rest of the limit is computed
+                from the number of cycles and the boards' measured speed.
             reprogram: If True, program a board that has another image, now and at each `reopen`. If False, refuse
                 the board.
 
@@ -167,7 +168,10 @@ class MiniCluster:
         return self._boards[board].link is not None or self._boards[board] in self._interrupted
 
     def reopen(self, board: int, *, timeout: float | None = None) -> None:
-        """Reopen a board that has restarted or lost its link, or raise a BoardError. A blank board is programmed."""
+        """Reopen a board that has restarted or lost its link. Program the board if it is blank.
+
+        Raises a BoardError if the board cannot be reopened.
+        """
         self._open(self._boards[board], self._timeout if timeout is None else timeout)
 
     def close(self) -> None:

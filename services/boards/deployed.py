@@ -104,7 +104,7 @@ class DeployedBoards:
 
     @property
     def is_late(self) -> bool:
-        """True if a board exceeded the deadline of the posted frame. `collect` then raises an error with the board."""
+        """True if a board exceeded the deadline of the posted frame. `collect` then raises an error about the board."""
         return self._cluster is not None and not self._cluster.seconds_left
 
     def _whole_cluster(self) -> MiniCluster:

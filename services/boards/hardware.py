@@ -61,7 +61,8 @@ class SimulatedHardware:
     def board(self, index: int) -> RtlBoard:
         """Return a blank board, or raise a SimulationError.
 
-        If the image that the board will get is known, the simulation of the image starts before the image is loaded.
+        If the image that the board will get is known, a simulation of the image's hardware is started now. The board
+        stays blank until the image is loaded, and then uses this simulation.
         """
         from pcie_shim.board.rtl_board import RtlBoard
 

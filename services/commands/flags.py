@@ -50,9 +50,9 @@ def source_of(uri: str, topic: str, type_: str) -> Source:
 
 
 def results_of(settings: Settings, topic: str | None) -> tuple[Deployment | None, str | None, str]:
-    """Return the settings' deployment, if any, and the URI and topic of the results.
+    """Return the deployment that the settings name, or None, and the URI and topic of the results.
 
-    A flag or variable overrides the URI or topic of the deployment.
+    `settings.uri` and `topic` override the URI and topic of the deployment, unless they are None.
     """
     # here, because boards and `status` start without the bridge and deployments
     from posteriors.posterior import RESULTS_TOPIC

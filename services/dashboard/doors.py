@@ -42,7 +42,7 @@ class Doors:
         app: The application that gets the admitted requests.
         policy: The accepted tokens, and the origins whose web pages may connect. The server's own pages may always
             connect.
-        loopback: Whether the server listens on loopback. Only this machine can then reach the server.
+        loopback: True if the server listens on loopback, so that only programs on this computer can reach the server.
     """
 
     def __init__(self, app: ASGIApp, policy: AccessPolicy, *, loopback: bool) -> None:

@@ -33,7 +33,7 @@ class View:
     """The choices of one browser.
 
     Attributes:
-        at: Place of the frame that is shown, or None for the newest frame.
+        at: Number of the frame that is shown (`KeptFrame.at`), or None to show the newest frame.
         chosen: Labels of the one or two variables whose marginal is shown. If it is empty, the default is shown.
     """
 

@@ -19,9 +19,10 @@ _MOST_NS: Final = 3600 * 10**9
 
 
 class Clock:
-    """A clock with times, which are compared with stamps, and ticks, which measure ages.
+    """A clock that gives a time, to compare with stamps, and ticks, to measure ages.
 
-    A simulation runs at any rate, and may pause or restart. A restart sets the time back, but never the ticks.
+    The clock of a simulation may run at any rate, and may pause. If the simulation restarts, the time goes back, but
+    the ticks do not.
     """
 
     def __init__(self, *, simulated: bool) -> None:
@@ -33,7 +34,7 @@ class Clock:
         """Time of the last message on /clock, before the first the creation of this object (monotonic seconds)."""
 
     def time_ns(self) -> int:
-        """Return the time for stamps in ns, or 0 before the first message of a simulation."""
+        """Return the current time in ns. In a simulation, return 0 until the first message on `/clock` arrives."""
         return (self._time or 0) if self.simulated else time.time_ns()
 
     def tick(self) -> int:

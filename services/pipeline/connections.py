@@ -24,7 +24,7 @@ OnState = Callable[[str, State, str], None]
 AFTER: Final = 2.0
 """Seconds after which a topic without a publisher is reported."""
 ROSAPI_TIME = 2.0
-"""Seconds to wait for an answer of rosapi. Many servers lack rosapi, so nothing is known about their topics."""
+"""Seconds to wait for an answer of rosapi. Many servers lack rosapi. The topics of such servers are not checked."""
 SETTLED_TIME = 3.0
 """If a server does not list an advertised topic after this many seconds, the topic counts as refused."""
 CHECK_INTERVAL = 10.0

@@ -1,4 +1,5 @@
 """Pipes between commands: lines of limited length from standard input, and the JSON objects that the lines contain.
+
 `terminal.output.print_json_line` writes lines to standard output.
 """
 

@@ -126,7 +126,7 @@ class Report:
         manager.report(status.why, ready=status.ready, alive=self._is_alive())
 
     def status(self) -> ProcessStatus:
-        """Call `get_status`, and return its result with the values added that every process reports."""
+        """Return the result of `get_status`, and add what every process reports, such as `pid` and `uptime_s`."""
         status, now, cpu_s = self._get_status(), time.monotonic(), time.process_time()
         alive = self._is_alive()
         frames = status.frames

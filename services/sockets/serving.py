@@ -284,8 +284,8 @@ async def report_failure(link: Link, error: BaseException) -> None:
 def outdated(deployment: Deployment, refused: AnyRecord) -> OutdatedError | None:
     """Return an error that advises a restart of this service, or None if a restart would not help.
 
-    `refused` is the record for which this service refused a master. A restart helps if `refused` is a `Hello`
-    that names another deployment than `deployment`, and the folder of `deployment` now contains the named deployment.
+    This service has loaded `deployment`, and has refused a master because of the record `refused`. A restart helps if
+    `refused` is a `Hello` for another deployment, and the folder of `deployment` now contains that other deployment.
     """
     if not isinstance(refused, Hello) or refused.deployment_hash == deployment.hash:
         return None

@@ -91,10 +91,10 @@ class ZScores:
     A line counts in a cycle with probability p, and has the count n after a run of c cycles.
 
     Attributes:
-        cycles: Length c of all runs.
+        cycles: Length c of each run. All runs have the same length.
         counts: Number of z-scores.
         draws: Number of independent sequences of random numbers. There is one per bank of seeds, or one per reading if
-            generators are never reset. The intervals are bootstrapped over these sequences.
+            generators are never reset. The intervals of `rms` and `mean` are bootstrapped over these sequences.
         rms: Root mean square of the z-scores. It is 1 for independent bits. If the variance of the counts is v times
             that of independent bits, the root mean square is sqrt(v).
         mean: Mean of the z-scores. It is 0 if the counts are unbiased.
@@ -177,8 +177,8 @@ def measure(
     with exact inference from the model. If a reading is impossible in the model, exact inference gives no posterior
     for the reading.
 
-    `own` is the filter of a deployment. With `own`, the readings are a sequence, and each reading is run with one bank
-    of seeds. Each posterior is compared with the posterior of the exact filter.
+    `own` is the filter of a deployment. With `own`, the readings are a sequence. Each reading is run only once, and not
+    with several banks of seeds. Each posterior is compared with the posterior of the exact filter.
 
     Raises:
         BuildError: There are fewer readings than replicas.

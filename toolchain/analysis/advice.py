@@ -58,7 +58,7 @@ class Candidate:
         cycles: Median cycles of a frame.
         seconds: Time of `cycles` at the clock frequency.
         alms, blocks: Estimated numbers of ALMs and of memory blocks on one board.
-        unfit: Reason why a board of this device cannot hold the machine, or empty.
+        unfit: Reason why the FPGA `Advice.device` cannot hold the machine, or empty.
     """
 
     machine: str

@@ -35,11 +35,10 @@ _WORK: Final = 2**27
 def agreement(
     machine: BM2Machine, bit: int, values: Mapping[int, NDArray[np.int64]]
 ) -> list[tuple[int, NDArray[np.float64]]]:
-    """Return each CDE whose factor contains the state bit `bit`, with its probabilities of a 1.
+    """Return the index of each CDE whose factor contains the bit `bit`, and the CDE's probabilities of drawing 1.
 
-    An item has the index of a CDE, and an array float64[states]. For each state, the array has the probability that
-    the CDE draws 1 for `bit`. `values` has an array int64[states] for each other bit of these factors. For each state,
-    the array has the value of this other bit.
+    `values` describes the states to examine. It maps each other bit of these factors to the bit's value in each state:
+    int64[states]. The probabilities are float64[states]: for each state, the chance that the CDE draws 1 for `bit`.
     """
     p, found = machine.parameters, []
     variable = next(at for at, mask in enumerate(p.masks) if mask >> bit & 1)
@@ -114,10 +113,10 @@ class ExactChain:
 
     @cached_property
     def law(self) -> NDArray[np.float64]:
-        """float64[states]: the stationary law after a sweep.
+        """float64[states]: the stationary distribution of the chain, whose transition matrix is `sweep`.
 
-        It is computed by the elimination of Grassmann, Taksar and Heyman. This method subtracts nothing, so it is exact
-        even where clipped codes make some states nearly inescapable.
+        It is computed by the elimination of Grassmann, Taksar and Heyman. This method subtracts nothing, so the result
+        is accurate even if clipped codes make some states nearly inescapable.
         """
         left = self.sweep.copy()
         for n in range(len(left) - 1, 0, -1):

@@ -123,7 +123,7 @@ class EmulatedBoards:
     ) -> FrameRun:
         """Run each board for `cycles` cycles; counts do not stop a board.
 
-        A board does not run if each of its lines has a code 0.
+        If every line of a board has a code 0 for the readings, no line can count, and the board does not run.
         """
         start = Start(
             addresses=(),
@@ -160,7 +160,7 @@ def addressed_chances(
 
 
 def one_replica(machine: BM1Machine) -> BM1Machine:
-    """Return `machine` with one replica instead of `replicas`."""
+    """Return a copy of `machine` that has only one replica."""
     return replace(machine, parameters=replace(machine.parameters, replicas=1))
 
 

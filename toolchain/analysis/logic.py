@@ -72,7 +72,7 @@ _FEW_WORDS: Final = 8
 
 
 class Of(StrEnum):
-    """The units in which a machine's logic is counted. The text of each unit names the VHDL that contains it."""
+    """The kinds of units that make up a machine's logic. The text of each kind names the VHDL entities of the unit."""
 
     BOARD = "board"
     """The units that every board has once: bm1_axi, bm_register_block, bm1_guard, and bm1_control.
@@ -339,9 +339,10 @@ def word_memories_of(p: BM1Parameters, inputs: int = 0) -> list[EqualMemories]:
 def place_memories(
     parameters: BM1Parameters, device: Device, table_length: int = LENGTH, inputs: int = 0
 ) -> Memories:
-    """Place tables in M20Ks, the deepest tables first. When the usable M20Ks are full, place tables in memory LABs.
+    """Place the memories of a BM1 in M20Ks and memory LABs.
 
-    The memories of random numbers and of words come before all tables, and are always in M20Ks.
+    The memories of random numbers and of the words that the host writes are always in M20Ks. The remaining
+    usable M20Ks take tables, the deepest tables first. The tables that do not fit there are in memory LABs.
     """
     tables = tables_of(parameters)
     room = math.floor(device.usable * device.blocks)

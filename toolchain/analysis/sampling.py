@@ -73,7 +73,7 @@ class Sampled:
         total_variation: Mean total variation from exact inference, or None without a model. A frame without a
             posterior has a total variation of 1.
         alone: Mean total variation over only the frames with a posterior, or None without a model.
-        cycles: Cycles of the longest-running board.
+        cycles: Statistics of the cycles of a frame. These cycles are those of the board that runs longest.
         sweep_cycles: Mean cycles of a sweep, or 0 if samples are taken after every move.
         effective_samples: Median and minimum of the effective samples of a frame. Unknown numbers are 0.
         r_hat: Median R-hat of a frame. A frame without an R-hat, for example of a single board, counts as 0. An

@@ -160,7 +160,10 @@ _MOST_LOST: Final = 0.5
 
 
 def pareto(points: Sequence[Point]) -> list[Point]:
-    """Return the Pareto front of total variation, cycles and ALMs. Leave out machines that lose most frames."""
+    """Return the Pareto front of total variation, cycles and ALMs.
+
+    Leave out machines that return no posterior in more than half of their runs.
+    """
     judged = [
         (each, (each.total_variation, each.cycles_median, math.inf if each.alms is None else each.alms))
         for each in points

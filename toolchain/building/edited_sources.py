@@ -55,14 +55,14 @@ _SHOWN: Final = 3
 
 
 def regenerate_images(directory: Path) -> tuple[list[str], list[tuple[str, Change]]]:
-    """Write the images again from the edited memories and parameters.
+    """Write the images again from a deployment's edited files of memories and parameters.
 
-    Return the edits as sentences, and the changed files. Edited sources are written in canonical form, and
+    Return the edits as sentences, and the changed files. The edited files are rewritten in canonical form, and
     `deployment.toml` gets the new hashes and parameters. An interrupted call may leave new images before
     `deployment.toml` has their hashes. The next call accepts such images and completes the work.
 
     Raises:
-        BuildError: The sources contradict each other, or need another machine.
+        BuildError: The edited files contradict each other, or need another machine.
         MifError: A memory's file does not fit this machine.
         DeploymentError: The deployment is missing or damaged.
     """

@@ -93,8 +93,8 @@ def quantise(
 ) -> Quantised:
     """Convert the probabilities of a model to codes of `prob_bits` bits (1 to 16), and compute the quantisation loss.
 
-    `scale` says whether each row, the whole table or nothing is first divided by its maximum. If each cell has its own
-    reading, `scale` must not be `Scale.ADDRESS`.
+    Before the conversion, each row of a table (`Scale.ADDRESS`), the whole table (`COLUMN`) or nothing (`NONE`) is
+    divided by its maximum. If each cell has its own reading, `scale` must not be `ADDRESS`.
     """
     prior = model.prior_distribution
     prior_codes, prior_loss = _quantised_prior(model, prob_bits, scale)

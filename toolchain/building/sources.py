@@ -121,8 +121,8 @@ def placed(
 ) -> tuple[Variable, ...]:
     """Return variables as changed by `--order` and `--path`, or raise a BuildError.
 
-    `order` names the sensor that each column reads. A column keeps its table and its conversion to addresses. It gets
-    the name, source and path of the sensor that it reads.
+    `order` lists one sensor for each column. The column keeps its own table and conversion to addresses, and takes the
+    name, source and path of the listed sensor. An item NAME=PATH in `path` replaces the path of the variable NAME.
     """
     columns = {variable.name: variable for variable in variables if variable.kind == "sensor"}
     names = names_in("--order", order or "") or list(columns)

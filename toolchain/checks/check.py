@@ -213,10 +213,11 @@ _LEAST_TOLERANCE_S: Final = 0.005
 
 
 def source_findings(deployment: Deployment) -> Iterator[Finding]:
-    """Find topics whose messages have no header, if the deployment has several topics.
+    """Find problems with the pairing of messages that have no header, if the deployment has several topics.
 
-    Messages without a header are paired with the messages of other topics by the time of receipt.
-    There is no finding if no topic has a header and the tolerance is large enough.
+    Messages without a header are paired by the time of receipt, and all other messages by their stamps. A tolerance
+    that is too small for times of receipt causes a warning. With a sufficient tolerance, there is a note if only some
+    topics lack a header, because the clocks of robot (stamps) and host (receipt) may differ.
     """
     if len(deployment.sources) < 2:
         return

@@ -25,7 +25,7 @@ class Severity(StrEnum):
     WARNING = "warning"
     """Some readings get no posterior or a wrong posterior, or resources are wasted."""
     NOTE = "note"
-    """Nothing is wrong if this is intended."""
+    """The finding may be intended. If so, nothing is wrong."""
 
 
 class Check(StrEnum):

@@ -1,6 +1,7 @@
 """The `toolchain` command (thesis 3.4), and the smaller subcommands `regenerate`, `fit` and `new`.
 
-Modules of commands import NumPy, and modules that need NumPy, only inside functions. Thus `--help` is fast.
+So that `--help` is fast, the modules of commands do not import NumPy at the top, neither directly nor through another
+module. They import it only inside functions.
 """
 
 import difflib
@@ -61,8 +62,8 @@ def memories(
 ) -> None:
     """Write the parameters and memory files again. With --model, also write images with the tables of the model.
 
-    For example `toolchain regenerate memories build/boat --model casestudies/boat`. Other entries of
-    deployment.toml, such as topics and endpoints, do not change.
+    For example `toolchain regenerate memories build/boat --model casestudies/boat`. The topics and endpoints in
+    deployment.toml do not change.
     """
     from toolchain.building.build import build_date
     from toolchain.building.regenerate import regenerate_memories

@@ -115,7 +115,10 @@ class BuildFlags(MachineOptions, ModelFlags):
 
 
 def model_file(path: Path) -> Path:
-    """Return a model's network file or a folder's `model.py`, or raise a ToolchainError if the file is missing."""
+    """Return the path of the file that defines a model, or raise a ToolchainError if the file is missing.
+
+    `path` is a network file, a `model.py`, the folder of a `model.py`, or the name of an installed model.
+    """
     if is_network(path):
         open_regular(path, NetworkFileError).close()
         return path

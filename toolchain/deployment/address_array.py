@@ -50,9 +50,9 @@ def written_codes(likelihoods: NDArray[np.float64], *, prob_bits: int, scale: Sc
 def written_prior(prior: ArrayLike, *, lines: int, prob_bits: int, replicas: int = 1) -> NDArray[np.uint16]:
     """Return the codes of a written prior: uint16[lines], or uint16[replicas, lines] for several replicas.
 
-    The prior may be the posterior of an earlier frame. Only the ratios of its numbers matter. With one number per line
-    of the machine, over all boards, all replicas share the prior. With `replicas` times as many numbers, each replica
-    has its own prior.
+    The prior may be the posterior of an earlier frame. Only the ratios of its numbers matter. `lines` is the number of
+    lines of all boards together. If `prior` has `lines` numbers, all replicas share the prior. If `prior` has
+    `replicas` * `lines` numbers, each replica has its own prior.
 
     Raises:
         ReadingError: The number of values is wrong, a value is not a probability, or all values are 0.

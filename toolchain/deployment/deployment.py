@@ -40,7 +40,10 @@ FILE_NAME: Final = "deployment.toml"
 UNFINISHED: Final = f"{FILE_NAME}.unfinished"
 """Name of a file that a folder has while a build writes the folder, and after a build that was interrupted."""
 FORMER_KEYS: Final = frozenset({"integrity", "integrity_frames"})
-"""Keys that earlier versions wrote. Reading a file with such a key is an error. The hash never included these keys."""
+"""Keys that earlier versions wrote. A file with such a key is refused, and the error tells the user to delete the key.
+
+The hash never included these keys, so it stays valid after the deletion.
+"""
 MOST_TRANSITIONS: Final = 2**24
 """Maximum number of transitions of a filter, lines x lines (128 MiB as float64)."""
 REPLICA: Final = "replica"

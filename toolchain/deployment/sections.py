@@ -401,10 +401,10 @@ MachineSection: TypeAlias = Annotated[
 
 
 class WrittenPrior(Section):
-    """`[prior]`: the topic of a written prior, with one number per line. Only the ratios of the numbers matter.
+    """`[prior]`: the source and path of a prior that arrives in messages, and that the host writes to the boards.
 
-    Without this section, a machine with `prior_mode = written` uses the prior of its images until a host writes a
-    prior.
+    The prior is an array with one number for each line of the machine. Only the ratios of the numbers matter. Without
+    this section, a machine with `prior_mode = written` uses the prior of its images until a host writes a prior.
     """
 
     source: int = Field(default=0, ge=0)

@@ -1,4 +1,7 @@
-"""Fit files, which are `.toml` for normal distributions and `.npz` for counted tables, and their use in models."""
+"""The files that `toolchain fit` writes, and their use in models.
+
+A fit of normal distributions is a `.toml` file. A fit of counted tables is a `.npz` file.
+"""
 
 import json
 import math

@@ -174,7 +174,7 @@ class Symbol:
     on_range: Literal["error", "clamp", "missing"] = "error"
     """Treatment of a reading out of range: as an error, as the nearest value in range (`clamp`), or as missing."""
     on_missing: Literal["error", "missing"] = "error"
-    """`missing` if a reading may be missing."""
+    """Treatment of a message that lacks the symbol's reading: as an error, or as a missing reading (`missing`)."""
 
     def __post_init__(self) -> None:
         if not self.name:

@@ -57,7 +57,7 @@ class Memory:
 
 
 def memories(deployment: Deployment, images: Sequence[Image]) -> tuple[Memory, ...]:
-    """Return the memories of each board, and the memories that are equal on all boards.
+    """Return the memories of all boards. A memory that is equal on all boards, such as a CDE, is returned only once.
 
     Generators that exist only in emulation (`rng = ideal`) have no memories.
     """

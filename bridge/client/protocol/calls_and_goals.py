@@ -215,12 +215,14 @@ class ServedServices(_Served):
         return self._wire.type_name(type_name, "srv")
 
     def answer(self, ticket: int, values: Mapping[str, Any] | str, *, ok: bool = True) -> None:
-        """Answer a request with fields, or with a reason as text if `ok` is False.
+        """Answer a request. `values` has the fields of the answer or, if `ok` is False, the reason as text.
 
-        If the connection of the request was lost, do nothing. A reason is sent in an additional field `reason`, and
-        `values` is an empty object. The reference server drops an answer whose `values` is a text, so its caller would wait for
-        ever (rosbridge_library/capabilities/service_response.py, `service_response_msg_fields`). `bridge.hub` passes
-        the reason on.
+        If the connection of the request was lost, do nothing.
+
+        A reason is sent in an additional field `reason` of the operation, and the operation's field `values` is then
+        an empty object. If the reason were sent in `values`, the reference server would drop the answer, and the caller
+        would wait for ever (rosbridge_library/capabilities/service_response.py, `service_response_msg_fields`).
+        `bridge.hub` passes the reason on.
 
         Raises:
             EncodeError: The values cannot be encoded as JSON. The request is then still pending.
@@ -298,7 +300,10 @@ class ServedActions(_Served):
     def receive(
         self, operation: dict[str, Any], data: bytes
     ) -> GoalRequested | CancelRequested | UnusableReceived | None:
-        """Handle a goal or a cancellation. Return None if the goal was refused here or has ended."""
+        """Handle a goal or a cancellation, and return it as an event.
+
+        Return None if this client refused the goal, or if the goal to cancel is not active.
+        """
         goal, action, args = operation.get("id"), operation.get("action"), operation.get("args")
         if not isinstance(goal, str) or not isinstance(action, str):
             return UnusableReceived(f"a goal without an action or an id arrived: {excerpt(data)}")

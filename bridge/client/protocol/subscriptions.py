@@ -198,10 +198,10 @@ class Subscriptions:
         return number
 
     def leave_out(self, topic: str | None) -> tuple[int, ...]:
-        """Do not subscribe to a topic again, because each message on the topic would end the connection.
+        """Leave a topic out on later connections, because its messages are too large and end the connection.
 
         Returns:
-            The numbers that `subscribe` has returned for this topic, or () if the topic has no subscription.
+            The numbers of the topic's subscriptions, or () if the topic is None or has no subscription.
         """
         subscribed = None if topic is None else self._subscribed.get(absolute(topic))
         if subscribed is None:
