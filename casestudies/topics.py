@@ -65,7 +65,8 @@ async def connected(name: str, work: str, uri: str) -> AsyncIterator[tuple[Ros, 
     """Connect to a server, and yield the connection and the `Readiness` of this process.
 
     Until the end of the context, the process `name` answers health checks through a socket in the run directory. The
-    answer says how recently `work` was done. The caller calls `Readiness.record` each time.
+    answer contains `work`, such as "a reading was published", and the time since `Readiness.record` was last called.
+    Call `Readiness.record` whenever the work has been done.
     """
     started, readiness = time.monotonic(), Readiness(work)
 

@@ -304,14 +304,18 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
 ) -> bool:
     """Run bit-sliced chains until each has drawn its samples, and store the number of cycles of each chain in `ends`.
 
-    Return True if all chains have finished. Return False, with unfinished chains, if `max_cycles` or the timeout of
-    the OPS may stop a chain before its last sample.
+    Return True if all chains have finished. Return False as soon as `max_cycles` or the timeout of the OPS may stop a
+    chain. The counts are then incomplete.
 
-    `vectors` contains `numbers`, `values`, `pointed`, `counts` and `room`. `counts` has a counter for each joint value
-    of the unknown bits. A counter counts the samples with its value, except counter 0, which counts sweeps. Counter 0
-    first counts from -burn_in up to 0, and then from -samples up to 0. The caller computes the number of samples with
-    value 0 from the other counters. `room` is working space for carries, for the bits of contexts, and for the events
-    of a sample.
+    `vectors` contains five arrays of vectors: `numbers`, `values`, `pointed`, `counts` and `room`. Bit i of a vector
+    belongs to chain i. `numbers` has the bits from the generator of each CDE. `values` has the values of the unknown
+    bits. `pointed` has a vector for each unknown bit, with a 1 for each chain whose sequencer draws the bit now.
+
+    `counts` has a counter for each joint value of the unknown bits. Counter i counts the samples with the joint value
+    i. Only counter 0 counts sweeps instead, first from -burn_in up to 0, and then from -samples up to 0. The caller
+    subtracts the sum of counters 1, 2, ... from `samples` to get the number of samples with the joint value 0.
+
+    `room` is working space for carries, for the bits of contexts, and for the events of a sample.
     """
     numbers, values, pointed, counts, room = vectors
     burn_in, samples, max_cycles, window, steps = limits

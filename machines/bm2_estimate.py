@@ -150,11 +150,11 @@ def effective_samples(values: npt.NDArray[np.integer], size: int) -> Floats:
 
 
 def batch_effective_samples(counts: npt.NDArray[np.integer]) -> Floats:
-    """Estimate the effective samples of each value from the means of a chain's batches: float64[values].
+    """Estimate the effective number of samples for each value from the means of a chain's batches: float64[values].
 
-    `counts` has the samples with each value up to the end of each batch, integers[batches, values]. The result is at
-    most the number of samples, and equal to it if the value has the same share in every batch. It is NaN if fewer than
-    `BATCHES_MIN` batches have samples.
+    `counts` is integers[batches, values]. `counts[batch, value]` is the number of samples with this value from the
+    start of the first batch to the end of this batch. An estimate is at most the number of all samples. It equals that
+    number if the value has the same share in every batch. It is NaN if fewer than `BATCHES_MIN` batches have samples.
     """
     of_batch = np.diff(counts.astype(np.float64), axis=0, prepend=0)
     of_batch = of_batch[of_batch.any(axis=1)]

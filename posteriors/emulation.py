@@ -120,7 +120,7 @@ class EmulatedPosterior(Posterior):
 def posterior(folder: str | Path, readings: Mapping[str, object], *, bank: int = 0) -> EmulatedPosterior:
     """Run the machines of a deployment, without boards, processes or a rosbridge server.
 
-    The machines of a filter compute its first frame.
+    If the deployment has a filter, the result is the posterior of the filter's first frame.
 
     Args:
         folder: The folder that `toolchain build` wrote.

@@ -488,7 +488,7 @@ class Session:
     def flush(self) -> None:
         """Send the messages in the core's outbox without waiting.
 
-        If the server leaves too many of these bytes unread, the connection is aborted.
+        If the server leaves too many bytes of messages from the outbox unread, the connection is aborted.
         """
         for message in self.core.data_to_send():
             websocket = self._websocket

@@ -147,9 +147,9 @@ class Offer:
     type: str
     client: Client
     fillers: Mapping[str, Filler]
-    """A filler of absent fields for each part of the type, by the part's name, such as `Request`.
+    """For each part of the type, such as `Request`, the `Filler` that adds absent fields to messages of the part.
 
-    If the type is unknown, there are no fillers.
+    The mapping is empty if the type is unknown.
     """
 
 

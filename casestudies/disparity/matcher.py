@@ -52,7 +52,10 @@ from terminal.connection import report_connection
 from terminal.output import check_writable, say, warn
 
 WINDOW: Final = 8
-"""Maximum number of sent tiles without an answer. Meanwhile, processes and boards work in parallel."""
+"""Maximum number of sent tiles without an answer.
+
+If several tiles are sent before the first answer arrives, the processes and the boards can work in parallel.
+"""
 PICTURE: Final = "disparity.png"
 _REPEAT_S: Final = 2.0
 """Seconds without a result after which the tiles that are not answered yet are sent again."""

@@ -47,7 +47,7 @@ if TYPE_CHECKING:
 QUEUE_ALL_DEPTH = 256
 """With `queue = all`, at most this many frames wait. One more frame ends the run with an error."""
 MOST_AT_PUBLISHER = 8
-"""Maximum number of results without an acknowledgement of the publisher. At this number, no further frame starts."""
+"""Maximum number of results that the publisher has not acknowledged. At this number, no further frame starts."""
 
 REMEMBERED = 1000
 """Quantiles of latencies are computed over the last published frames, at most this many."""

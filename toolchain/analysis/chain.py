@@ -37,8 +37,8 @@ def agreement(
 ) -> list[tuple[int, NDArray[np.float64]]]:
     """Return the index of each CDE whose factor contains the bit `bit`, and the CDE's probabilities of drawing 1.
 
-    `values` describes the states to examine. It maps each other bit of these factors to the bit's value in each state:
-    int64[states]. The probabilities are float64[states]: for each state, the chance that the CDE draws 1 for `bit`.
+    `values` describes the states to examine. For each bit of the factors except `bit`, `values` has the bit's values
+    in all states: int64[states]. The result has one probability for each state: float64[states].
     """
     p, found = machine.parameters, []
     variable = next(at for at, mask in enumerate(p.masks) if mask >> bit & 1)

@@ -121,7 +121,7 @@ class EmulatedBoards:
     def run_for(
         self, addresses: Inputs, prior_address: int, bank: int, cycles: int, prior: WrittenPrior = None
     ) -> FrameRun:
-        """Run each board for `cycles` cycles; counts do not stop a board.
+        """Run each board for `cycles` cycles, without a target count.
 
         If every line of a board has a code 0 for the readings, no line can count, and the board does not run.
         """

@@ -72,7 +72,7 @@ _FEW_WORDS: Final = 8
 
 
 class Of(StrEnum):
-    """The kinds of units that make up a machine's logic. The text of each kind names the VHDL entities of the unit."""
+    """The kinds of units that make up a machine's logic. The docstring of a kind names the unit's VHDL entities."""
 
     BOARD = "board"
     """The units that every board has once: bm1_axi, bm_register_block, bm1_guard, and bm1_control.

@@ -170,9 +170,11 @@ class Relation:
     """Bits whose XOR is 0 in every cycle."""
 
     group: int
-    """Index of the group of columns. A group is a bank of seeds.
+    """Index of the group of seeds for which the XOR is 0. A group has one seed per column (BM1) or per CDE (BM2).
 
-    If each cell has its own generator, a group is a line of a bank, and its index is bank * lines + line.
+    A BM1 has one group per bank of seeds. If each cell of the BM1 has its own generator, each line of a bank is a
+    group, with the index bank * lines + line. In a BM2, each board has one group per bank, with the index
+    bank * boards + board.
     """
     bits: tuple[Bit, ...]
 
