@@ -290,7 +290,7 @@ class Subscriber(RunService):
         self._last_tick, self._last_sent = reading.received_tick, self._clock.tick()
         # a master that reads slowly gets the newest readings, not all of them late
         if self._link.backlog > _BACKLOG_LIMIT and not self._queue_all:
-            self._passed_over += 1
+            self._passed_over += len(self._deployment.sources)
             return
         passed_over, unpaired = self._passed_over, self._assembler.unpaired
         record = msgspec.structs.replace(
@@ -304,4 +304,5 @@ class Subscriber(RunService):
             self._passed_over_sent, self._unpaired_sent = passed_over, unpaired
             self._once = False  # the reading has been sent: a later failure must not end the service
         else:
-            self._passed_over += 1  # without a master: the next one learns of it with its first reading
+            # without a master: the next one learns of it with its first reading
+            self._passed_over += len(self._deployment.sources)

@@ -146,8 +146,9 @@ class Reading(Record, tag="reading", frozen=True):
 
     `stamp_ns` is the newest stamp of the messages in the set, or the time of receipt if they have no stamps.
     `prior_codes` is the prior from a message, with two bytes per cell of each replica. An empty `prior_codes` selects
-    the prior in the machine. `passed_over` is the number of readings that the subscriber has dropped since its last
-    `Reading`. `unpaired` is the number of messages that have remained unpaired since that `Reading`.
+    the prior in the machine. `passed_over` is the number of messages that the subscriber has dropped since its last
+    `Reading`. A dropped reading counts as one message for each topic. `unpaired` is the number of messages that have
+    remained unpaired since that `Reading`.
     """
 
     # When it was read on the robot, when its last message arrived here, and when this record was sent.

@@ -80,6 +80,20 @@ def test_readings_without_a_master_are_counted_as_passed_over(boat, link, monkey
     assert [reading.passed_over for reading in link.sent] == [1]
 
 
+def test_a_dropped_reading_of_two_topics_counts_as_two_messages(boat, link):
+    """The master divides the number of messages by that of the topics, for the steps of a filter."""
+    sources = boat.sources[0], boat.sources[0].model_copy(update={"topic": "/second"})
+    variables = tuple(each.model_copy(update={"source": at % 2}) for at, each in enumerate(boat.variables))
+    subscriber = Subscriber(
+        Settings(), boat.model_copy(update={"sources": sources, "variables": variables}), link.make
+    )
+    for backlog in (BUSY, 0):
+        link.backlog = backlog
+        for at in range(2):
+            subscriber._read(at, Message("/t", dict(READING), 1, 2))
+    assert [reading.passed_over for reading in link.sent] == [2]
+
+
 def test_an_unusable_message_is_reported_by_its_cause(boat, link):
     subscriber = Subscriber(Settings(), boat, link.make)
     for value in ("x", "y"):
