@@ -36,7 +36,10 @@ _SENSOR_BITS_MAX: Final = 64  # columns whose widths fit into the capability reg
 
 
 class BM1Kind(MachineKind):
-    """The BM1 (thesis 2.1.2): exact inference, computed approximately by a line of AND gates per searched value."""
+    """The BM1 (thesis 2.1.2).
+
+    For each value of the searched variables, a line of AND gates and a counter approximate the exact posterior.
+    """
 
     name = "BM1"
     has_hardware = True
@@ -50,7 +53,11 @@ class BM1Kind(MachineKind):
     }
 
     def due_sections(self, parameters: BM1Parameters) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-        """Yield the sections of a file: the prior, any column tables (MIFs in the thesis), any random numbers."""
+        """Yield the name, dtype and shape of each section that a programming file must have.
+
+        The first section is the prior. Then each sensor column with a table has a section (a MIF in the thesis). With
+        `rng = table`, the last section is the random numbers.
+        """
         yield "prior", "<u2", (parameters.prior_addresses, parameters.lines)
         if parameters.has_tables:
             for column, bits in enumerate(parameters.sensor_bits, start=1):

@@ -311,9 +311,10 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
     belongs to chain i. `numbers` has the bits from the generator of each CDE. `values` has the values of the unknown
     bits. `pointed` has a vector for each unknown bit, with a 1 for each chain whose sequencer draws the bit now.
 
-    `counts` has a counter for each joint value of the unknown bits. Counter i counts the samples with the joint value
-    i. Only counter 0 counts sweeps instead, first from -burn_in up to 0, and then from -samples up to 0. The caller
-    subtracts the sum of counters 1, 2, ... from `samples` to get the number of samples with the joint value 0.
+    `counts` has a counter for each joint value of the unknown bits. From i = 1 on, counter i counts the samples with
+    the joint value i. Counter 0 counts sweeps: first from -burn_in up to 0, and then from -samples up to 0. Each sweep
+    after the burn-in gives a sample, so the number of samples with the joint value 0 is `samples` minus the sum of the
+    other counters.
 
     `room` is working space for carries, for the bits of contexts, and for the events of a sample.
     """

@@ -205,7 +205,7 @@ def decode_error(frame: Frame) -> tuple[int, str]:
 
 _PROGRAM_BEGIN: Final = struct.Struct("<Q32s8s")
 NO_TOKEN: Final = bytes(8)
-"""Zeros in place of a token. A loader sends them if the loader's host has no link to the board."""
+"""Eight bytes that stand for no token. A loader sends them if its host does not hold the board's register port."""
 
 
 class ProgramBegin(NamedTuple):

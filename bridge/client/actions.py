@@ -46,8 +46,8 @@ class Goal:
     """A goal that this client has sent. Use `async for feedback in goal`, then `await goal.result(timeout)`.
 
     The iteration ends when the goal ends. If the connection is lost, the iteration and `result` fail, because the
-    server never reports the end. If the program leaves `async with` early, the goal is cancelled. The iteration and
-    `result` then fail, too.
+    server never reports the end. A block `async with goal` is optional. If the goal has not ended at the end of the
+    block, the client cancels it. The iteration and `result` then fail, too.
 
     Attributes:
         action: Name of the action.

@@ -200,7 +200,8 @@ class Ros:
 
         Raises:
             NameFormError: The name or the type is malformed.
-            TypeConflictError: This client already subscribes to the topic with another type or delivery.
+            TypeConflictError: This client already subscribes to the topic with another type, or with other options.
+                Only `queue_size` may differ.
             OptionError: A number is out of its range.
             DisconnectedError: The client was closed.
         """

@@ -278,8 +278,8 @@ def _all_finite(value: Any) -> bool:
 def envelope_of(data: bytes) -> bytes:
     """Return the bytes of an operation up to and including the first key `msg`.
 
-    These bytes may be an envelope; `topic_of` checks this. If the first `LONGEST` bytes do not contain the key, the
-    result is empty.
+    In a publish operation, these bytes are usually the envelope, the part before the ROS message. `topic_of` checks
+    this. If the first `LONGEST` bytes do not contain the key, the result is empty.
     """
     key = _KEY if data[:1] < b"\x80" else _CBOR_KEY
     at = data.find(key, 0, LONGEST)

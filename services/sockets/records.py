@@ -130,8 +130,8 @@ class Trouble(Record, tag="trouble", frozen=True):
 Addresses = list[int | list[int] | None]
 """Addresses of a frame's readings, in the order of the variables. None is a missing reading.
 
-If replicas or cells have readings of their own, each variable has a flat list, row by row. In a list, -1 is a missing
-reading.
+If replicas or lines have readings of their own, a variable has a flat list: the addresses of replica 0, then those of
+replica 1, and so on. In a list, -1 is a missing reading.
 """
 
 Values = list[float | str | None]

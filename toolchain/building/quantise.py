@@ -43,11 +43,12 @@ class ColumnLoss:
     mass: float
     """Sum of P(S, K) over the cells with code 0: the probability that a reading selects code 0 on the true line."""
     kl_bits: float
-    """KL(Q(S | k) || P(S | k)) in bits, averaged over the reading k of this column.
+    """KL(Q(S | k) || P(S | k)) in bits, averaged over the readings k of this column.
 
     P is the exact posterior for the reading k of this column alone. Q is the posterior for the same reading, from the
-    column's codes. If each line has its own reading (`sensor_mode = cell`), k is the reading of every line. KL(P || Q)
-    would be infinite if a line with a small probability gets the code 0.
+    column's codes. A reading with code 0 on every line has no Q, and is left out. With `sensor_mode = cell`, all lines
+    are assumed to have the same reading k. KL(P || Q) would be infinite if a line with a small probability gets the
+    code 0.
     """
     dead_values: int
     """Number of values that have a probability above 0, but code 0 on every line."""

@@ -200,7 +200,10 @@ class Deployment(DeploymentFile):
         return self.directory / self.boards[board].image
 
     def new_filter(self) -> "Filter | None":
-        """Return the filter in the file of the section `[filter]`, or None without it. May raise a DeploymentError."""
+        """Load the filter from the file that the section `[filter]` names. Return None if there is no such section.
+
+        Raises a DeploymentError if the file is unusable.
+        """
         if self.filter is None:
             return None
         # here, because a subscriber loads a deployment without NumPy

@@ -234,7 +234,10 @@ class Model:
         )
 
     def with_bits(self, bits: Mapping[str, int]) -> Self:
-        """Return the model with the numbers of address bits in `bits`, by variable name, or raise a ModelError."""
+        """Return a copy of the model with other numbers of address bits, or raise a ModelError.
+
+        `bits` has the numbers for some variables, by name. The numbers of the other variables do not change.
+        """
         select = self.prior_select
         return replace(
             self,
