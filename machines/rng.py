@@ -223,7 +223,8 @@ def mix(words: Words) -> Words:
 def map_tables(images: Words) -> Words:
     """Return the look-up tables of a linear map over GF(2), one for each byte of the state: uint64[bits / 8, 256].
 
-    `images[j]` is the result for the state in which only bit j is 1."""
+    `images[j]` is the result for the state in which only bit j is 1.
+    """
     tables = np.zeros((len(images) // 8, 256), dtype=np.uint64)
     for j, image in enumerate(images):
         table, half = tables[j // 8], 1 << (j % 8)

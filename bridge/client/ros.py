@@ -472,8 +472,8 @@ def connect(
 
     Raises:
         UriError: The URI is not a WebSocket URI.
-        OptionError: An option is out of its range, or a file cannot be read. For `robot:NAME`, errors about the route
-            are raised when the client is opened.
+        OptionError: An option is out of its range, or a file cannot be read. For `robot:NAME`, errors in `token`,
+            `headers`, `ca_file` and `tls` are raised when the client is opened.
     """
     if ros_version not in {"auto", "1", "2"}:
         raise OptionError(f"ros_version must be auto, 1 or 2, not {ros_version!r}")
