@@ -1,7 +1,7 @@
 """Quality of service of a ROS 2 topic, for the field `qos` of `advertise` and `subscribe`.
 
-Newer ROS 2 servers read the field, and other servers silently ignore it. The server chooses omitted settings. It
-adapts a subscription to the topic's publishers.
+Newer ROS 2 servers read the field, and other servers silently ignore it. The server chooses a value for each omitted
+setting. For a subscription, the server takes the publishers of the topic into account.
 """
 
 import math

@@ -1,6 +1,6 @@
 -- ================================================================================================
 -- rosbayes: bm1_registers
--- The register map of a board. It checks, executes and answers each access, and starts the machine.
+-- Checks, executes and answers each access to the registers of a board, and starts the machine.
 -- MIT licence; datasheet: docs/hardware/bm1_registers.md
 -- ================================================================================================
 

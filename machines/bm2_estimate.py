@@ -11,7 +11,7 @@ import numpy.typing as npt
 from machines.bm2 import BM2Parameters, BM2StopReason, unpack_all
 
 BATCHES_MIN: Final = 20
-"""With fewer batches, the number of effective samples is not estimated from the means of the batches."""
+"""Minimum number of batches from which `batch_effective_samples` makes an estimate. With fewer, it returns NaN."""
 
 AGREE: Final = 1.1
 """Maximum R-hat at which boards count as agreeing on one distribution (Gelman and Rubin 1992)."""

@@ -202,9 +202,9 @@ class BM2Kind(MachineKind):
     def posterior(
         self, machines: Sequence[BM2Machine], frame: FrameInput, variables: Sequence[str] = ()
     ) -> tuple[npt.NDArray[np.float64], Mapping[str, str]]:
-        """Return the posterior and the statistics of a frame. Its chains run one after another in this process.
+        """Run a frame in this process, one machine after another, and return the posterior and statistics of the frame.
 
-        Each chain draws the same samples as on a board.
+        Each machine draws the same samples as on a board.
 
         Raises:
             NoPosteriorError: The frame has no posterior.

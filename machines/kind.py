@@ -57,7 +57,10 @@ class FrameInput:
 
 
 class FrameSettings(NamedTuple):
-    """The registers that start or resume a frame, in the order of the map. Every kind of machine has the registers."""
+    """The settings of a frame: the values of four registers, in the order of the register map.
+
+    The host writes the settings before it starts or resumes the frame. Every kind of machine has these registers.
+    """
 
     target_count: int
     max_cycles: int

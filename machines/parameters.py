@@ -72,8 +72,8 @@ class SensorMode(StrEnum):
 class Sequencer(StrEnum):
     """Order in which a BM2 draws unknown bits.
 
-    With `coloured`, variables in a common factor have different colours. A BM2 then draws several bits at once: one bit
-    of each variable that has the same colour.
+    With `coloured`, each variable has a colour, and variables in a common factor have different colours. A BM2 then
+    draws several bits at once: one bit of every unknown variable of one colour.
     """
 
     LINEAR = "linear"

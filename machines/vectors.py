@@ -153,6 +153,6 @@ def ones_in(builder: Any, vector: Any) -> Any:
 
 @in_llvm(types.boolean, VECTOR)
 def some(builder: Any, vector: Any) -> Any:
-    """Return whether a vector has a 1."""
+    """Return whether at least one bit of a vector is 1."""
     whole = builder.bitcast(vector, ir.IntType(512))
     return builder.icmp_unsigned("!=", whole, ir.Constant(ir.IntType(512), 0))

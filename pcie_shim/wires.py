@@ -1,4 +1,4 @@
-"""Figures of the links whose transfer times can be modelled: rate, latency, and whether all boards share a wire."""
+"""Rates and latencies of PCIe and USB/JTAG, from which the transfer times of a link are modelled."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

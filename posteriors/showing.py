@@ -46,7 +46,10 @@ def _plane(axes: Sequence[Axis], values: NDArray[Any]) -> tuple[list[Axis], NDAr
 
 
 def as_html(axes: Sequence[Axis], values: NDArray[np.float64], facts: Iterable[str]) -> str:
-    """Return HTML with a table of the axes, facts and a picture. It has no scripts or styles: viewers remove them."""
+    """Return HTML that contains a table of the axes, the facts as text, and a picture.
+
+    The HTML contains no scripts or styles, because viewers would remove scripts and styles.
+    """
     best = np.unravel_index(values.argmax(), values.shape)
     rows = [
         (

@@ -94,7 +94,11 @@ def formatted(level: str, text: str, *, name: str = "") -> str:
 
 
 def relayed(line: str, process: str) -> str:
-    """Return a line from a child in the current log format. A line that is a JSON log record is not changed."""
+    """Return a child's line for the log of this process.
+
+    If the log format is JSON, a line that is not a log record becomes the message of a new record. Otherwise, the line
+    is only escaped, as in `one_line`.
+    """
     if log_format() is LogFormat.TEXT or _is_record(line):
         return one_line(line)
     return json_line("info", line, process=process)

@@ -184,7 +184,7 @@ class WebSocket(WebSocketTransport):
         self._answered.set()
 
     def messages_received(self, messages: list[bytes]) -> None:
-        """Pass the messages to `on_messages`, after `begin`."""
+        """Pass the messages to `on_messages`. Keep messages that arrive before `begin`; `begin` passes them on."""
         if self.opened:
             self._on_messages(messages)
         else:

@@ -289,8 +289,8 @@ def envelope_of(data: bytes) -> bytes:
 def topic_of(envelope: bytes) -> str | None:
     """Return the topic of an envelope, or None if the bytes are not an envelope.
 
-    An envelope is the text before the message in a publish operation. The operation has only the keys `op`, `topic` and
-    `msg`, and `msg` is the last key.
+    An envelope is the JSON before the message in a publish operation: `{"op":"publish","topic":"/t","msg":`. Bytes
+    with a further key, or without `op` or `topic`, are not an envelope.
     """
     try:
         operation: Any = orjson.loads(envelope + b"{}}")

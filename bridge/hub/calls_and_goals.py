@@ -62,7 +62,10 @@ _CANCEL_ALL: Final = "/_action/cancel_goal"
 
 @dataclass(frozen=True, slots=True)
 class Caller:
-    """A client that waits for an answer, with its request's id, encoding, and name of the service or action."""
+    """A client that waits for the answer to a request.
+
+    The request gave the id, the name of the service or action, and the encoding of the answer.
+    """
 
     client: Client
     id: OperationId

@@ -76,13 +76,14 @@ class Filler:
             message: The message.
             room: Number of bytes by which the nested messages may grow.
             keep: If true, the absent fields are also added to `message`. If false, they are only returned, which saves
-                about a tenth of the time for a small message. If None is returned, they are added in both cases.
+                about a tenth of the time for a small message.
 
         Returns:
             The absent fields as JSON, followed by two closing braces. The caller replaces the last two braces of the
             received operation by these bytes. The message must be the last value of the operation.
-            The bytes are empty if no field was absent. The result is None if a nested message has grown. The caller
-            must then encode the operation again.
+            The bytes are empty if no field was absent.
+            The result is None if a nested message has grown. The absent fields are then in `message`, even if `keep` is
+            false, and the caller must encode the operation again.
 
         Raises:
             RefusedOperationError: The nested messages would grow by more than `room`.

@@ -1,6 +1,6 @@
 """Topics: advertising, publishing, subscribing and latching.
 
-The subscribers to one encoding share an encoded message.
+If several subscribers to a topic request the same encoding, the hub encodes each message once for all of them.
 """
 
 import time

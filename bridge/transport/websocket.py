@@ -315,7 +315,7 @@ class WebSocketTransport(asyncio.Protocol):
             self._interrupt(data, end)
 
     def postpone(self, messages: list[bytes]) -> None:
-        """Keep messages for the next turn, which handles them before data that arrived later."""
+        """Keep messages until other tasks have run. The messages are then handled before data that arrived later."""
         self._postponed = messages
 
     def _interrupt(self, data: bytes, at: int) -> None:

@@ -26,7 +26,10 @@ class BadImageError(Exception):
 
 
 def read_image(message: Mapping[str, Any], *encodings: str) -> NDArray[Any]:
-    """Return a sensor_msgs/Image as an array [height, width]. Raises a BadImageError if it is not in `encodings`."""
+    """Return a sensor_msgs/Image as an array [height, width].
+
+    Raises a BadImageError if the encoding of the image is not in `encodings`, or if the image is damaged or too large.
+    """
     encoding = message.get("encoding")
     if encoding not in encodings:
         raise BadImageError(f"its encoding is {str(encoding)[:20]!r}, expected {' or '.join(encodings)}")

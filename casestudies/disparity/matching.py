@@ -42,7 +42,7 @@ def box_sum(values: NDArray[np.float32], reach: int) -> NDArray[np.float32]:
 def filtered(image: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Return the output of each filter, float32[filters, height, width], for an image uint8[height, width].
 
-    For the derivatives, the edge pixels are repeated beyond the border.
+    `gradient_x` and `gradient_y` need one pixel beyond the border. This pixel is a copy of the edge pixel.
     """
     padded = np.pad(image.astype(np.float32), 1, mode="edge")
     across = padded[:, 2:] - padded[:, :-2]

@@ -74,7 +74,10 @@ class _Box:
 
 
 class Scene:
-    """A wall and a floor, with spheres and boxes of random size. Spheres and boxes move from pair to pair."""
+    """A wall and a floor, with spheres and boxes of random size.
+
+    The spheres and boxes move a little from one stereo pair to the next.
+    """
 
     def __init__(self, seed: int) -> None:
         """Choose a scene at random. Equal seeds give equal pairs."""

@@ -174,7 +174,10 @@ def read_measured(folder: Path, robot: int, subjects: dict[int, int]) -> tuple[l
 
 
 def windows(track: Track, measured: Sequence[Measured]) -> tuple[list[Window], Counter[str]]:
-    """Return the seconds in which the robot hardly moved and saw enough landmarks. Count omitted seconds by reason."""
+    """Return the one-second windows in which the robot saw enough landmarks and hardly moved.
+
+    Also return the number of omitted windows for each reason.
+    """
     kept: list[Window] = []
     left_out: Counter[str] = Counter()
     if not measured:

@@ -34,7 +34,7 @@ SIGHTINGS_TOPIC: Final = "/mrclam/sightings"
 SIGHTINGS_TYPE: Final = "mrclam_msgs/Sightings"
 MAP_FRAME: Final = "map"
 LANDMARKS: Final = range(6, 21)
-"""The numbers of the 15 landmarks in the data set. The numbers 1 to 5 are robots."""
+"""The numbers of the 15 landmarks. They start at 6, because the data set gives the numbers 1 to 5 to robots."""
 
 SIGHTINGS_MSG: Final = (
     "# mrclam_msgs/Sightings: range (m) and absolute bearing (rad, counter-clockwise from +x) of the landmarks "
@@ -243,7 +243,7 @@ def player(
         bool, typer.Option("--print-msg", help="Print the .msg file of mrclam_msgs/Sightings and exit.")
     ] = False,
 ) -> None:
-    """Play a recorded robot's sightings of landmarks, and compare each posterior's mean with the reference.
+    """Play a robot's recorded sightings of landmarks, and compare posteriors with the robot's reference positions.
 
     Each frame is published after the result of the previous frame.
     """

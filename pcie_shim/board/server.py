@@ -129,8 +129,8 @@ def serve_board(
 ) -> None:
     """Serve board number `index` until `stop` is set, and then remove the socket files.
 
-    By default, the board is a blank emulated board. `link` delays the frames of hosts. `on_ready` is called when both
-    sockets are listening.
+    By default, the board is a blank emulated board. `link` is the model of a slower link. It delays every transfer
+    between host and board. `on_ready` is called when both sockets are listening.
 
     With `pin`, this thread is pinned to one of its allowed cores, number `index` modulo the number of cores. A board
     computes for only tenths of a millisecond. This time is too short for Linux to distribute the boards' threads over

@@ -33,7 +33,7 @@ from pcie_shim.host.socket_link import LONGEST_POLL_S
 from pcie_shim.programming_file import Image
 
 SLACK_S: Final = 5.0
-"""Default of `slack`: seconds that a frame may take in addition to the time for its cycles."""
+"""Default of `slack`: seconds that each slice of a frame may take in addition to the time for the slice's cycles."""
 FIRST_WAIT_S: Final = 0.01
 """Maximum number of seconds for which `collect` polls only the board that was started last."""
 PROGRAMMING_S: Final = 30.0

@@ -110,7 +110,7 @@ def encode_boards(boards: Sequence[BoardResult]) -> msgspec.Raw:
 
 
 def decode_boards(result: FrameResult) -> list[BoardResult]:
-    """Decode the boards' results in a record."""
+    """Return the boards' results, decoded from a record."""
     return _decoder.decode(result.boards)
 
 

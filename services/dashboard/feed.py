@@ -177,7 +177,10 @@ class Feed:
         return sum(each.frames for each in recent) / max(min(RATE_SECONDS, last - first), 1)
 
     def stage_times(self, now_s: float) -> list[tuple[int, list[float]]]:
-        """Return one row per second, the oldest first: the second's age, and the mean microseconds of each stage."""
+        """Return the mean times of the stages in each recent second, the oldest second first.
+
+        Each row contains the age of a second in seconds, and the mean time of each stage in microseconds.
+        """
         rows = []
         for second in self._seconds:
             means = [total / max(count, 1) for total, count in zip(second.sums, second.counts, strict=True)]

@@ -19,10 +19,10 @@ _MOST_NS: Final = 3600 * 10**9
 
 
 class Clock:
-    """A clock that gives a time, to compare with stamps, and ticks, to measure ages.
+    """A clock that gives two numbers: a time to compare with stamps, and a tick to measure ages.
 
     The clock of a simulation may run at any rate, and may pause. If the simulation restarts, the time goes back, but
-    the ticks do not.
+    the tick does not.
     """
 
     def __init__(self, *, simulated: bool) -> None:

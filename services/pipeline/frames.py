@@ -20,7 +20,7 @@ from toolchain.deployment.address import to_address
 from toolchain.errors import ReadingError, ReadingMissingError
 
 UNPAIRED_WARNING = 8
-"""If every needed topic has had this many messages since the last frame, the gap between their stamps is reported."""
+"""If no frame forms after this many messages of every needed topic, the gap between the topics' stamps is reported."""
 
 
 class _SourceReader:

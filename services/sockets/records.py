@@ -111,7 +111,8 @@ class Rosbridge(Record, tag="rosbridge", frozen=True):
 class Notice(Record, tag="notice", frozen=True):
     """A service sends the master a message for the user. The run continues.
 
-    With `--log-level debug`, the master sends the subscriber a `Notice` with the number of each frame.
+    In the other direction, the master sends the subscriber a `Notice` with the number of each frame, but only with
+    `--log-level debug`. The subscriber writes this notice to its log.
     """
 
     level: str

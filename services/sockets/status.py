@@ -68,7 +68,10 @@ class FrameCounts(msgspec.Struct, frozen=True, kw_only=True):
         last: tuple[int, int],
         without: Mapping[str, int] | None = None,
     ) -> FrameCounts:
-        """Return the counts. `last` is the number and the monotonic time (ns) of the last frame, or 0 if unknown."""
+        """Return the counts.
+
+        `last` is the number and the monotonic time (ns) of the last frame. Each of the two is 0 if it is unknown.
+        """
         number, tick = last
         return cls(
             received=received,

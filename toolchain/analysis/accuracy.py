@@ -132,9 +132,9 @@ class Accuracy:
     """Accuracy and cycles of a machine on some readings.
 
     Attributes:
-        posteriors: Number of posteriors: one per frame, or one per replica of a frame.
+        posteriors: Number of requested posteriors: one per frame, or one per replica of a frame.
         banks: Number of seed sets with which each reading was run.
-        impossible: Share of posteriors with readings that are impossible on every line, so that no counter counts.
+        impossible: Share of the requested posteriors for which no line can count, because every line has a code 0.
         without: Share of runs without a posterior, including runs in which all counts remained 0.
         overflow: Share of runs that ended with an overflow.
         machine: Difference of the machine from the model, or None without a model.

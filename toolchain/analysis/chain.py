@@ -35,10 +35,11 @@ _WORK: Final = 2**27
 def agreement(
     machine: BM2Machine, bit: int, values: Mapping[int, NDArray[np.int64]]
 ) -> list[tuple[int, NDArray[np.float64]]]:
-    """Return the index of each CDE whose factor contains the bit `bit`, and the CDE's probabilities of drawing 1.
+    """Return an index and probabilities for each CDE whose factor contains the bit `bit`.
 
-    `values` describes the states to examine. For each bit of the factors except `bit`, `values` has the bit's values
-    in all states: int64[states]. The result has one probability for each state: float64[states].
+    The index is that of the CDE. The probabilities are those with which the CDE draws 1 in each state to examine:
+    float64[states]. `values` describes the states. For each bit of the factors except `bit`, `values` has the bit's
+    values in all states: int64[states].
     """
     p, found = machine.parameters, []
     variable = next(at for at, mask in enumerate(p.masks) if mask >> bit & 1)

@@ -153,7 +153,10 @@ def inspect_chain(
 
 
 def check_same(deployment: Deployment, machine: BM2Machine, model: NetworkModel) -> None:
-    """Raise a BuildError if the model would not build the deployment's machine. Edited codes are not compared."""
+    """Raise a BuildError if a build from `model` would give another machine than the deployment's.
+
+    If files of the deployment were edited by hand after the build, the codes of the two machines are not compared.
+    """
     p = machine.parameters
     place = {name: at for at, name in enumerate(model.names)}.__getitem__
     scopes = tuple(tuple(map(place, term.scope)) for term in model.factors)

@@ -36,7 +36,10 @@ SLOW_FRAMES: Final = 20
 """Default number of frames for a slow machine: a machine with one generator per cell, or without LFSRs."""
 LEAST_FRAMES: Final = 20
 SLOW_LEAST_FRAMES: Final = 3
-"""With replicas, the default number of frames is `SLOW_FRAMES` divided by their number, but at least this many."""
+"""Minimum of the default number of frames for a slow machine with replicas.
+
+The default is `SLOW_FRAMES` divided by the number of replicas.
+"""
 SLOW_BANKS: Final = 1
 
 

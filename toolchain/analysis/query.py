@@ -172,7 +172,10 @@ def _machine_answer(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contents:
-    """A network's variables, the searched variables, and the pairs that cannot both be known variables of a BM1."""
+    """A network's variables and the searched variables.
+
+    `apart` says which variables cannot be known variables of the same BM1.
+    """
 
     joint: JointDistribution
     searched: tuple[str, ...] = ()
@@ -216,9 +219,10 @@ class Contents:
 
 
 def contents(joint: JointDistribution, searched: Sequence[str] = (), known: Sequence[str] = ()) -> Contents:
-    """Return the variables of a network, and which of the candidates in `known` depend on each other.
+    """Return the variables of a network, and the pairs of candidates that are dependent given `searched`.
 
-    If `known` is empty, all variables that are not searched are candidates.
+    Candidates are variables that could be known. `known` names the candidates. If `known` is empty, all variables that
+    are not searched are candidates. Without searched variables, there are no pairs.
 
     Raises:
         ToolchainError: A variable does not exist or is named twice, or there are too many candidates.

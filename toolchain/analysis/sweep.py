@@ -46,8 +46,8 @@ class Point(BaseModel):
 
     Attributes:
         key: SHA-256 of everything on which the results depend.
-        total_variation: Mean total variation from the model's posterior over all frames. A frame without a posterior
-            has a total variation of 1.
+        total_variation: Mean, over all frames, of the total variation between the machine's posterior and the model's
+            posterior. If the machine gives a frame no posterior, the frame has a total variation of 1.
         total_variation_low: Lower end of the 95 % interval of `total_variation`.
         total_variation_high: Upper end of the 95 % interval of `total_variation`.
         quantising: Mean total variation between the model's posterior and exact inference on the machine's codes.

@@ -269,8 +269,10 @@ def describe(plan: MachinePlan | BM2Plan, layout: BoardLayout, images: Sequence[
 def known_variables(plan: MachinePlan | BM2Plan) -> tuple[Variable, ...]:
     """Return the known variables of the deployment, with their sources and paths in messages.
 
-    With `--sensor-mode threshold`, the values of a sensor are codes. Raises a BuildError if `--order`, `--path` or a
-    sources file names a variable that the model does not have.
+    With `--sensor-mode threshold`, the boards get codes instead of addresses. For a sensor, `bits` and `values` of the
+    returned variable then describe the codes.
+
+    Raises a BuildError if `--order`, `--path` or a sources file names a variable that the model does not have.
     """
     options, variables = plan.options, plan.model.variables
     variables = variables if options.sources is None else options.sources.place(variables)

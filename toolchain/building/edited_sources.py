@@ -62,7 +62,8 @@ def regenerate_images(directory: Path) -> tuple[list[str], list[tuple[str, Chang
     `deployment.toml` has their hashes. The next call accepts such images and completes the work.
 
     Raises:
-        BuildError: The edited files contradict each other, or need another machine.
+        BuildError: The edited files contradict each other, contain an invalid value, or change a constant or a seed
+            that only a new build can change.
         MifError: A memory's file does not fit this machine.
         DeploymentError: The deployment is missing or damaged.
     """

@@ -175,7 +175,7 @@ def build_options(
 ) -> BuildOptions:
     """Return the options of a build. For several topics, the file `sources` replaces `--topic` and `--type`.
 
-    With `is_checked`, `--uri`, `--topic` and `--type` may be missing.
+    The flags `--uri`, `--topic` and `--type` may be missing if `is_checked` is true.
     """
     from toolchain.outputs.mif import read_table
 

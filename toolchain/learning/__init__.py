@@ -29,7 +29,7 @@ class FitPrior(StrEnum):
 
 @dataclass(frozen=True, kw_only=True)
 class FitOptions:
-    """The flags of `toolchain fit`. Its arguments, the model and the recordings, are not included."""
+    """The flags of `toolchain fit` that say how recordings are read, and how tables are learned."""
 
     truth: Annotated[
         list[str],

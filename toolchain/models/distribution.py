@@ -114,8 +114,9 @@ class IntervalType:
 class LabelType:
     """Named values. The names stand for the numbers 0, 1, 2 ... in order, with two exceptions.
 
-    If the names are equally spaced numbers (`10`, `20`, `30`), each name stands for its number. In any order, `false`,
-    `no` and `off` stand for 0, and `true`, `yes` and `on` for 1, as in a ROS bool.
+    If the names are equally spaced numbers (`10`, `20`, `30`), each name stands for its number. If the two names are
+    `false` and `true`, `no` and `yes`, or `off` and `on`, then `false`, `no` or `off` stands for 0 and the second name
+    of the pair for 1, also if the type lists the names in the opposite order. A ROS bool has the same numbers.
     """
 
     labels: tuple[str, ...]

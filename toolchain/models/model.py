@@ -50,7 +50,10 @@ class Normal:
     sigma: ArrayLike
     """Standard deviation in the unit of the reading: one number for all lines, or float64[lines]."""
     floor: float = 0.0
-    """Probability added to each bin for outliers, as a fraction of the probability of a bin centred at the mean."""
+    """Probability that is added to each bin, because a reading may be an outlier.
+
+    The number is a fraction of the peak: the probability of a bin centred at the mean.
+    """
     outliers: float = 0.0
     """Share of readings that do not depend on S."""
 
@@ -79,7 +82,7 @@ class TabulatedVariable:
     on_range: Literal["error", "clamp", "missing"] = "error"
     """Treatment of a reading out of range: as an error, as the nearest value in range (`clamp`), or as missing."""
     on_missing: Literal["error", "missing"] = "error"
-    """`missing` if a reading may be missing."""
+    """If a reading is missing, `error` rejects the frame, and `missing` computes the frame without the reading."""
     path: str = ""
     """Path of the variable in the message. If the path is empty, the message is searched for the name."""
     states: tuple[str, ...] = ()

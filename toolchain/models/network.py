@@ -90,7 +90,8 @@ def network_model(
 ) -> NetworkModel:
     """Return the network of P(searched | known), with the variables in `given` fixed at their values.
 
-    `symbols` are the variables of the joint distribution. The machine has its variables in the same order.
+    `symbols` are all variables of the joint distribution. The network has only the variables that the question needs,
+    in the order of `symbols`.
 
     Raises:
         ModelError: A factor contains a number that is negative, infinite or NaN, or contains only zeros for the

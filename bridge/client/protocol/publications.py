@@ -107,7 +107,8 @@ class Publications:
     def define(self, type_name: str, definitions: Definitions) -> None:
         """Store the definitions for a message type.
 
-        If the definitions include the type itself, the next message of each advertisement of this type is checked.
+        If the definitions include the type itself, `publish` checks the next message of each advertisement of this
+        type. After one valid message, the messages of the advertisement are no longer checked.
         """
         self._definitions[ros1_type(type_name)] = definitions
         for advertised in self._advertised.values():
