@@ -38,7 +38,8 @@ _SENSOR_BITS_MAX: Final = 64  # columns whose widths fit into the capability reg
 class BM1Kind(MachineKind):
     """The BM1 (thesis 2.1.2).
 
-    For each value of the searched variables, a line of AND gates and a counter approximate the exact posterior.
+    Each combination of values of the searched variables has a line of AND gates and a counter. The counts of all lines
+    give an approximation of the exact posterior.
     """
 
     name = "BM1"

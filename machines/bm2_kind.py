@@ -202,9 +202,9 @@ class BM2Kind(MachineKind):
     def posterior(
         self, machines: Sequence[BM2Machine], frame: FrameInput, variables: Sequence[str] = ()
     ) -> tuple[npt.NDArray[np.float64], Mapping[str, str]]:
-        """Run a frame in this process, one machine after another, and return the posterior and statistics of the frame.
+        """Run a frame on the machines of all boards, and return the posterior and statistics of the frame.
 
-        Each machine draws the same samples as on a board.
+        The machines run in this process, one after another. Each machine draws the same samples as on its board.
 
         Raises:
             NoPosteriorError: The frame has no posterior.

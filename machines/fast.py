@@ -107,9 +107,9 @@ class FastBM1(BM1Kernel):
 
     @property
     def kept_cycles(self) -> int:
-        """Number of cycles at the start of a frame whose random bits the cache can keep, for each bank of seeds.
+        """Number of cycles for which the cache can keep random bits between frames, for each bank of seeds.
 
-        0 means that no bits are kept between frames.
+        The bits are those of the first cycles of a frame. 0 means that no bits are kept between frames.
         """
         return 0 if self._of_frame else self._kept_blocks * BLOCK_CYCLES
 

@@ -96,8 +96,8 @@ def formatted(level: str, text: str, *, name: str = "") -> str:
 def relayed(line: str, process: str) -> str:
     """Return a child's line for the log of this process.
 
-    If the log format is JSON, a line that is not a log record becomes the message of a new record. Otherwise, the line
-    is only escaped, as in `one_line`.
+    If the log format is JSON and the line is not a log record, the result is a new record with the line as its
+    message. In every other case, the result is the line, escaped as in `one_line`.
     """
     if log_format() is LogFormat.TEXT or _is_record(line):
         return one_line(line)

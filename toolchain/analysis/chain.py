@@ -35,11 +35,10 @@ _WORK: Final = 2**27
 def agreement(
     machine: BM2Machine, bit: int, values: Mapping[int, NDArray[np.int64]]
 ) -> list[tuple[int, NDArray[np.float64]]]:
-    """Return an index and probabilities for each CDE whose factor contains the bit `bit`.
+    """Return the index of each CDE whose factor contains the bit `bit`, and the CDE's probabilities of drawing 1.
 
-    The index is that of the CDE. The probabilities are those with which the CDE draws 1 in each state to examine:
-    float64[states]. `values` describes the states. For each bit of the factors except `bit`, `values` has the bit's
-    values in all states: int64[states].
+    Each CDE has one probability for each state in `values`: float64[states]. `values` describes the states. It maps
+    every other bit of these factors to the values of that bit in the states: int64[states].
     """
     p, found = machine.parameters, []
     variable = next(at for at, mask in enumerate(p.masks) if mask >> bit & 1)

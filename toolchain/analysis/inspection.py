@@ -36,9 +36,9 @@ SLOW_FRAMES: Final = 20
 """Default number of frames for a slow machine: a machine with one generator per cell, or without LFSRs."""
 LEAST_FRAMES: Final = 20
 SLOW_LEAST_FRAMES: Final = 3
-"""Minimum of the default number of frames for a slow machine with replicas.
+"""Fewest frames that a slow machine with replicas runs by default.
 
-The default is `SLOW_FRAMES` divided by the number of replicas.
+By default, the number of frames is `SLOW_FRAMES` divided by the number of replicas, or this value if it is larger.
 """
 SLOW_BANKS: Final = 1
 

@@ -59,7 +59,7 @@ class Point(BaseModel):
         without: Share of runs without a posterior.
         cycles_median: Median cycles of a frame.
         cycles_95: 95th percentile of the cycles of a frame.
-        alms: ALMs of the largest board, or None if no FPGA has generators of this kind.
+        alms: ALMs of the largest board, or None with ideal random numbers, because no FPGA can generate them.
         blocks: Memory blocks of the largest board.
         fits: Whether the largest board fits the device.
     """

@@ -175,7 +175,7 @@ def build_options(
 ) -> BuildOptions:
     """Return the options of a build. For several topics, the file `sources` replaces `--topic` and `--type`.
 
-    The flags `--uri`, `--topic` and `--type` may be missing if `is_checked` is true.
+    If `is_checked` is true, the model is only checked, not built. `--uri`, `--topic` and `--type` may then be missing.
     """
     from toolchain.outputs.mif import read_table
 

@@ -50,9 +50,9 @@ class Normal:
     sigma: ArrayLike
     """Standard deviation in the unit of the reading: one number for all lines, or float64[lines]."""
     floor: float = 0.0
-    """Probability that is added to each bin, because a reading may be an outlier.
+    """Probability added to each bin, as a fraction of the probability of a bin centred at the mean.
 
-    The number is a fraction of the peak: the probability of a bin centred at the mean.
+    With a floor, outliers remain possible.
     """
     outliers: float = 0.0
     """Share of readings that do not depend on S."""
