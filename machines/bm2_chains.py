@@ -316,7 +316,8 @@ def run_sliced(  # noqa: PLR0915 - vectors are not passed to functions
     after the burn-in gives a sample, so the number of samples with the joint value 0 is `samples` minus the sum of the
     other counters.
 
-    `room` is working space for carries, for the bits of contexts, and for the events of a sample.
+    `room` is working space. It holds carries, the bits that the CDEs make for each context, and for each counter the
+    chains that increment the counter in this cycle.
     """
     numbers, values, pointed, counts, room = vectors
     burn_in, samples, max_cycles, window, steps = limits

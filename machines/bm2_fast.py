@@ -315,10 +315,9 @@ def fill(wiring: Wiring, numbers: npt.NDArray[np.uint16], generators: Words, one
 
 @jit
 def refill(exponents: Integers, numbers: npt.NDArray[np.uint16], first: int, rows: int) -> None:
-    """Replace the random numbers in `rows` successive rows of `numbers` by those of the next block.
+    """Replace the random numbers of `rows` CDEs, stored one after the other in `numbers`, by those of the next block.
 
-    A row has the random numbers of one CDE, as vectors of `CHUNK` numbers. `first` is the index of the first row's
-    first vector.
+    `first` says where the numbers of the first CDE begin, counted in vectors of `CHUNK` numbers.
     """
     top, near = exponents[0], exponents[2] == 2  # then the exponents are 32, 22, 2 and 1
     for row in range(first, first + rows * (top + 1), top + 1):

@@ -91,7 +91,7 @@ class BM2Kind(MachineKind):
         return BM2Machine(parameters, tables, supports, sections.get("rng"))
 
     def registers(self, parameters: BM2Parameters) -> UsedRegisters:
-        """Return the registers of a board. The board has one line, because it runs one chain of the whole model."""
+        """Return the registers that a board uses. `lines` is 1, because each board runs a chain of the whole model."""
         words = parameters.state_words
         if parameters.stream * words > STREAM_WORDS_MAX:
             raise ParameterError(

@@ -124,11 +124,7 @@ class Topic:
     name: str
     """Absolute name."""
     largest: int
-    """Maximum size of a message as JSON, in bytes.
-
-    A publish operation has at most `HubLimits.message_bytes`. The size of the operation without the message is
-    subtracted.
-    """
+    """Maximum size of a message as JSON, in bytes: `HubLimits.message_bytes` minus the rest of a publish operation."""
     type: str = ""
     """Type in the form of this hub's ROS version, or an empty string while no client has named a type."""
     advertisements: dict[Client, Advertisement] = field(default_factory=dict)

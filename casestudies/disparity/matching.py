@@ -77,7 +77,7 @@ def matching_costs(
 
 
 def likelihoods(costs: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return P(cost | disparity) relative to cost 0, in the shape of the costs.
+    """Return P(cost | disparity), scaled so that the cost 0 has likelihood 1, in the shape of `costs`.
 
     A disparity beyond the border has no cost. It gets the mean likelihood of the pixel's other disparities, so a
     missing cost neither favours nor excludes a disparity. In the first column of pixels, all likelihoods are equal.

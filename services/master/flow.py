@@ -256,7 +256,7 @@ class FrameFlow:
             self._at_publisher.clear()
 
     def awaited(self, peer: Peer) -> Awaited | None:
-        """Return the frame or the results that a peer has not answered yet, or None if it has answered everything."""
+        """Return what a peer still has to do (answer a frame, or publish results) and by when, or None if nothing."""
         if peer is self._peers.app and self._computing is not None:
             what, since = f"answer frame {self._computing.number}", self._computing.sent / 1e9
             return Awaited(what, since, self._settings.board_timeout + ANSWER_TIME)

@@ -118,7 +118,10 @@ class Report:
         self._samples: deque[tuple[float, float, int]] = deque(maxlen=_SAMPLES)
 
     def sample(self, manager: ServiceManager) -> None:
-        """Record CPU time and frames for the rates, and report to the service manager."""
+        """Record the CPU time and the number of completed frames, and report to the service manager.
+
+        The status computes the CPU load and the frame rate from these records.
+        """
         # not `status`, which would read /proc every second
         status = self._get_status()
         completed = status.frames.completed if status.frames is not None else 0

@@ -96,7 +96,7 @@ class Of(StrEnum):
     PLACE_BIT = "place bit"
     """A bit of the index in bm1_table_player. The index is the place of the current random number in the table.
 
-    The logic of the bit computes the bit's value in the next index.
+    The logic of the bit loads the seed, or the bit of the index after the steps of a cycle.
     """
     WORD = "word"
     """A word that the host writes for a frame, in bm1_words. Its logic decodes the address and checks the value."""

@@ -77,7 +77,7 @@ class Replay:
     earlier: Callable[[int], tuple[_Posterior, int] | None] | None = None
     """Function that returns a row's posterior and cycles from an interrupted run, or None if that run lacks the row.
 
-    If `is_sequence` is False, the function is not needed.
+    Only a sequence uses the function: its filter must see all rows again. Otherwise, only missing rows are computed.
     """
 
     @property

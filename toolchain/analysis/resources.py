@@ -59,12 +59,13 @@ class Estimate:
         """A clause that names the insufficient resource. It is empty if the machine fits."""
         usable = self.device.usable
         if self.memories.blocks > usable * self.device.blocks:
-            return f"it takes {self.memories.blocks:,} memory blocks, and there are {self.device.blocks:,}"
+            room = math.floor(usable * self.device.blocks)
+            return f"the machine takes {self.memories.blocks:,} memory blocks, but only {room:,} of {self.device.blocks:,} can be used"
         if self.alm_share > usable:
-            return f"it takes {self.alms:,.0f} ALMs, and {usable * self.device.alms:,.0f} of {self.device.alms:,} can be used"
+            return f"the machine takes {self.alms:,.0f} ALMs, but only {usable * self.device.alms:,.0f} of {self.device.alms:,} can be used"
         mlabs = self.device.alms * MLAB_SHARE / MLAB_ALMS
         if self.memories.mlabs > mlabs:
-            return f"its tables take {self.memories.mlabs:,} memory LABs, and there are {mlabs:,.0f}"
+            return f"the machine's tables take {self.memories.mlabs:,} memory LABs, but there are only {mlabs:,.0f}"
         return ""
 
 
@@ -99,7 +100,7 @@ def _why_not(
         strict=True,
     ):
         if needed > room:
-            return f"it takes {needed:,} {what} registers, and {whose} has {room:,}"
+            return f"the machine takes {needed:,} {what} registers, but {whose} has only {room:,}"
     return estimate(machine, device, table_length=table_length, inputs=(interface or (0, 0))[0]).why_not
 
 
@@ -155,8 +156,11 @@ def boards_needed(
     if count == 1:
         return 1, f"All {parameters.lines} lines fit one {device.title}: {share}."
     boards = f"{count} boards" if count > 2 else "two boards"
-    reason = f"on one {device.title} {why_not(parameters.lines)}"
-    why = f"{parameters.lines} lines need {boards}: {reason}; {largest} lines per board take {share}. An estimate, not a compilation."
+    reason = f"One {device.title} is too small: {why_not(parameters.lines)}"
+    why = (
+        f"{parameters.lines} lines need {boards}. {reason}. With {largest} lines, a board takes {share}. "
+        "This is an estimate, not a compilation."
+    )
     if parameters.replicas > 1 and (whole := replicas_on_a_board(parameters.lines)):
         why += f" With --replicas {whole} or fewer, all lines fit one board."
     return count, why

@@ -141,7 +141,10 @@ def code_findings(machine: CheckedMachine) -> Iterator[Finding]:
 
 
 def loss_findings(quantised: Quantised, options: BuildOptions) -> Iterator[Finding]:
-    """Find outlier floors (minimum likelihoods) that become code 0, and models whose true line often has code 0."""
+    """Find outlier floors (minimum likelihoods) that become code 0, and models that often give the true line code 0.
+
+    The true line is the line of the true value in a frame drawn from the model.
+    """
     for floor in quantised.floors:
         yield warning(Check.VANISHED_FLOOR, floor.name, floor.what, floor.advice)
     mass = sum(loss.mass for loss in quantised.losses)

@@ -180,11 +180,11 @@ class Relation:
 
 
 def relations(kind: RngKind, seeds: NDArray[np.uint64], prob_bits: int) -> tuple[list[Relation], int]:
-    """Search groups of columns for 2, 3 or 4 random bits whose XOR is 0 in every cycle. Such bits are a `Relation`.
+    """Search each group of generators for 2, 3 or 4 random bits whose XOR is 0 in every cycle (a `Relation`).
 
-    `seeds` are uint64[groups, columns]. The machine ANDs the bits of the columns in a group. The random number that is
-    compared with a code is the low `prob_bits` bits of a generator's state. To limit the time to a few seconds, the
-    search may stop before the last group.
+    `seeds` are uint64[groups, columns], with a generator per column of a BM1 or per CDE of a BM2. The random bits of a
+    generator are the low `prob_bits` bits of its state, which the machine compares with a code. To limit the time to a
+    few seconds, the search may stop before the last group.
 
     Returns:
         The relations (for each group at most one, with the fewest bits), and the number of searched groups.

@@ -140,7 +140,7 @@ def test_boards_for_the_boat():
     cells = replace(BOAT, sensor_mode=SensorMode.CELL)
     count, why = boards_needed(cells, D8)
     assert 2 <= count <= 4
-    assert why.startswith("1024 lines need two boards: on one Gidel Proce V D8")
+    assert why.startswith("1024 lines need two boards. One Gidel Proce V D8")
     assert "209,920 of 262,400 can be used" in why
     assert boards_needed(replace(cells, lines=256), D8)[0] == 1
     for boards in range(1, count):
@@ -152,13 +152,13 @@ def test_boards_for_more_lines_than_the_register_map_holds():
     many = BM1Parameters(lines=10_000, sensor_bits=(2,))
     count, why = boards_needed(many, D8)
     assert count == 3
-    assert "10,000 result registers, and the map has 4,096" in why
+    assert "10,000 result registers, but the map has only 4,096" in why
 
 
 def test_boards_for_more_lines_than_the_interface_holds():
     count, why = boards_needed(BOAT, D8, interface=(20, 300))
     assert count == 4
-    assert "1,024 result registers, and the interface has 300" in why
+    assert "1,024 result registers, but the interface has only 300" in why
     with pytest.raises(BuildError, match="use --replicas 2 or fewer"):
         boards_needed(replace(BOAT, lines=8, replicas=3), D8, interface=(20, 2))
 
@@ -167,7 +167,7 @@ def test_boards_for_more_lines_than_the_interface_holds():
     ("board", "limit"),
     [
         (replace(BOAT, lines=256), "ALMs"),
-        (BM1Parameters(lines=300, sensor_bits=(2,)), "4,200 result registers, and the map has 4,096"),
+        (BM1Parameters(lines=300, sensor_bits=(2,)), "4,200 result registers, but the map has only 4,096"),
         (
             BM1Parameters(
                 lines=10, sensor_bits=(3, 3, 3, 3), sensor_mode=SensorMode.CELL, rng=RngKind.LFSR16

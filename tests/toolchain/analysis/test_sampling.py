@@ -72,4 +72,4 @@ def test_resources():
     estimate = chain_resources(machine_of(wide), DEVICE)
     assert estimate.memories.blocks > 18 * 2**17 / 1024
     assert not estimate.fits
-    assert "memory blocks" in estimate.why_not
+    assert "but only 2,053 of 2,567 can be used" in estimate.why_not

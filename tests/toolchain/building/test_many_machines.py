@@ -294,7 +294,7 @@ def test_boards_are_filled_with_machines(case):
     assert_refused(toolchain(*fill), "--replicas fill", "--device")
     report = done(toolchain(*fill, "--device", "proce-v-d8")).stdout
     assert "40 machines fill a board" in report
-    assert "with 41, it takes 4,100 result registers, and the map has 4,096." in report
+    assert "with 41, the machine takes 4,100 result registers, but the map has only 4,096." in report
     deployment = load_deployment(out)
     assert (deployment.machine.replicas, len(deployment.boards)) == (40, 1)
     done(toolchain(*fill, "--device", "proce-v-d8", "--set", "size=5000"))
@@ -302,7 +302,7 @@ def test_boards_are_filled_with_machines(case):
     assert (deployment.machine.replicas, len(deployment.boards)) == (1, 2)
     report = done(toolchain(*fill, "--device", "proce-v-d8", "--interface", "20x1200")).stdout
     assert "12 machines fill a board" in report
-    assert "with 13, it takes 1,300 result registers, and the interface has 1,200." in report
+    assert "with 13, the machine takes 1,300 result registers, but the interface has only 1,200." in report
     over = ("build", case, "-o", out, *TARGET, "--replicas", "50")
     assert_refused(toolchain(*over), "--partitions 2 or more", "--replicas 40 or fewer")
     assert_refused(
