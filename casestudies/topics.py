@@ -1,4 +1,4 @@
-"""Shared code of case studies: publications that drop messages, readiness, and frames with true positions."""
+"""Shared code of case studies: publishing without waiting for a slow server, health checks, and true positions."""
 
 import asyncio
 import contextlib

@@ -42,7 +42,7 @@ entity bm1_guard is
     run_until_i  : in    std_logic_vector(63 downto 0);  -- cycle at which the slice ends; 0: no end
     bank_i       : in    std_logic_vector(31 downto 0);  -- number of the seed set
     prior_i      : in    std_logic_vector(31 downto 0);  -- prior select of a board without replicas
-    halt_i       : in    std_logic_vector(255 downto 0); -- bit r of HALT: a resume stops replica r
+    halt_i       : in    std_logic_vector(255 downto 0); -- bit r of HALT: replica r does not continue at a resume
     bad_input_i  : in    std_logic;                      -- an input word is too large
     -- verdict
     error_o : out   std_logic_vector(7 downto 0); -- reason of a refusal; 0: none

@@ -23,7 +23,10 @@ FAST_CODES_MAX: Final = 2**24
 
 
 def make_kernel(machine: "BM1Machine", *, boards: int = 1) -> "BM1Kernel":
-    """Return the fastest kernel that can run the machine. Its cache has 1 / `boards` of the usual size."""
+    """Return the fastest kernel that can run the machine.
+
+    `boards` is the number of kernels that share the usual cache size for random bits. Each kernel gets an equal share.
+    """
     parameters = machine.parameters
     codes = parameters.columns << parameters.prob_bits
     if parameters.shared and parameters.rng.lfsr_bits is not None and codes <= FAST_CODES_MAX:

@@ -399,14 +399,14 @@ class BM2Start:
 
 
 def cde_table(factor: npt.NDArray[np.float64], prob_bits: int) -> npt.NDArray[np.uint16]:
-    """Return the table of codes of a factor's CDE (`BM2Machine.tables`).
+    """Return the table of a factor's CDE (`BM2Machine.tables`).
 
-    The factor is float64[cardinalities of the variables]. For n bits, the result is uint16[n * 2**(n - 1)]. Each code
+    The factor is float64[cardinalities of the variables]. For n bits, the result is uint16[n * 2**(n - 1)]. Each entry
     expresses the odds of one bit. The odds are the value of the factor for bit = 1, divided by its value for bit = 0.
 
-    A variable's codes beyond its cardinality, up to the next power of two, are unused. If a bit decides between a
-    used and an unused code, the odds favour the used code as far as a table can. If both codes are unused, the odds
-    are 1. The odds are also 1 if another variable has an unused code.
+    The bits of a variable can form numbers from its cardinality up to the next power of two. These numbers stand for
+    no value. If a bit decides between a value and such a number, the odds favour the value as far as an entry can. If
+    the bit decides between two such numbers, or if another variable has such a number, the odds are 1.
     """
     # NaN at unused codes: what is computed with one is NaN, too
     padded = np.full([1 << (cardinality - 1).bit_length() for cardinality in factor.shape], np.nan)

@@ -50,9 +50,9 @@ PREPARED_CYCLES: Final = 2**14
 class FastBM1(BM1Kernel):
     """A kernel for shared LFSRs that runs many cycles at a time (thesis 2.1.2 and 4.4).
 
-    If each frame restarts the generators from a bank of seeds, a cache of at most `kept_bytes` bytes keeps random bits
-    between frames. Nothing is kept without restarts, or if `kept_bytes` is too small for one block of cycles of each
-    bank. Each frame then computes its own bits.
+    If each frame restarts the generators from a bank of seeds, all frames with this bank begin with the same random
+    bits. A cache of at most `kept_bytes` bytes keeps these bits between frames. If frames do not restart the
+    generators, or if the cache cannot hold one block of cycles for every bank, each frame computes its own bits.
 
     Raises:
         MachineError: The generators of the machine are not LFSRs, or are not shared.

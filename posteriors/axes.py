@@ -58,7 +58,10 @@ def reading_order(labels: Sequence[str]) -> list[int]:
 
 
 def in_words(axes: Sequence[Axis], indices: Mapping[str, float]) -> str:
-    """Return a cell or a mean as text: `x -0.5 m, y 2.5 m`. Without a deployment, show indices: `cell x 2, y 1`."""
+    """Return a cell or a mean as text: `x -0.5 m, y 2.5 m`.
+
+    If no axis has a `dimension`, the text shows indices: `cell x 2, y 1`.
+    """
     ordered = [axes[at] for at in reading_order([axis.label for axis in axes])]
     words = ", ".join(f"{printable(axis.label)} {axis.shown(indices[axis.label])}" for axis in ordered)
     return words if any(axis.dimension for axis in axes) else f"cell {words}"

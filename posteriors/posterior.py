@@ -76,7 +76,10 @@ class Posterior:
         return self.sizes[0] if self.labels[0] == REPLICA else 1
 
     def replica(self, at: int) -> "Posterior":
-        """Return the posterior of replica `at`, without the label `replica`. Raises a LabelError if none exists."""
+        """Return the posterior of replica `at`, without the label `replica`.
+
+        Raises a LabelError if there is no replica `at`, or if all counts of the replica are 0.
+        """
         if not 0 <= at < self.replicas:
             raise LabelError(f"there is no replica {at}: expected 0 to {self.replicas - 1}")
         if self.labels[0] != REPLICA:

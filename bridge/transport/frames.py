@@ -114,7 +114,8 @@ def frame_end(data: bytes, at: int, *, masked: bool, largest: int) -> int:
     Returns:
         The index after the frame. If the frame is incomplete, this index is beyond `data`. The result is `UNKNOWN`
         if the frame's header is incomplete. The result is `UNSOUND` if the frame is invalid, or if its payload has
-        more than `largest` bytes. `websockets` must handle an unsound frame at once.
+        more than `largest` bytes. Pass an unsound frame to `websockets` at once, even if the frame is incomplete. The
+        library then refuses the frame.
     """
     size = len(data)
     if size < at + 2:

@@ -72,8 +72,9 @@ _STAGES: Final[tuple[_Stage, ...]] = (
 
 
 def stage_shares(instances: Iterable[Instance]) -> tuple[StageShare, ...]:
-    """Return the stages in order. Stages that no frame with a posterior reports are left out.
+    """Return the stages in order, computed from the frames with a posterior.
 
+    A stage is left out if its time is unknown in all of these frames.
     This process measures `rosbridge out`, from the sending of a result to its arrival. `/bm/frame` reports all
     other stages.
     """

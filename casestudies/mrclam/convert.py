@@ -159,7 +159,10 @@ def read_track(folder: Path, robot: int) -> Track:
 
 
 def read_measured(folder: Path, robot: int, subjects: dict[int, int]) -> tuple[list[Measured], int]:
-    """Return a robot's sightings of landmarks. Also return how many have an unknown barcode or a negative range."""
+    """Return a robot's sightings of landmarks, and the number of omitted measurements.
+
+    Measurements with an unknown barcode or a negative range are omitted.
+    """
     path = folder / f"Robot{robot}_Measurement.dat"
     found, misread = [], 0
     for _, (time, barcode, away, bearing) in read_columns(

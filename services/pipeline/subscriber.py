@@ -3,8 +3,8 @@
     topic ──message──▶ _follow ──▶ FrameAssembler.take ──readings──▶ _forward ──Reading──▶ master
     timer ───────────▶ _wake ────▶ FrameAssembler.due ───readings──▶
 
-The timer runs while a set of messages waits for a topic that may be missing. In a simulation, messages of
-`/clock` replace the timer.
+The timer limits how long a set of messages waits for a message that may belong to the set. In a simulation, messages
+of `/clock` replace the timer.
 """
 
 import asyncio

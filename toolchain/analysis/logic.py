@@ -106,7 +106,11 @@ class Of(StrEnum):
     The logic of the memory writes the initial words after a reset, and reads words for the host.
     """
     REPLICA = "replica"
-    """A replica, if there are several. Its logic, in bm1_control and bm1_readout, handles stop, resume and outcome."""
+    """A replica on a board with several replicas.
+
+    The logic of the replica is in bm1_control and bm1_readout. It stops and resumes the replica, and selects the
+    replica's outcome for the host. A board with one replica does not need this logic.
+    """
 
 
 WORST_ERROR: Final = 0.06
@@ -322,7 +326,7 @@ def random_memories_of(p: BM1Parameters | BM2Parameters, table_length: int) -> l
 def word_memories_of(p: BM1Parameters, inputs: int = 0) -> list[EqualMemories]:
     """Return the memories of the words that the host writes (bm1_words).
 
-    If the host writes the prior, there is one more memory, with the codes of the initial prior.
+    If the host writes the prior, another memory holds the initial prior, which a reset copies into the words.
     """
     used = BM1.registers(p)
     depths = [max(inputs, used.input_words, 1)]

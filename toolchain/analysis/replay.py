@@ -77,7 +77,8 @@ class Replay:
     earlier: Callable[[int], tuple[_Posterior, int] | None] | None = None
     """Function that returns a row's posterior and cycles from an interrupted run, or None if that run lacks the row.
 
-    Only a sequence uses the function: its filter must see all rows again. Otherwise, only missing rows are computed.
+    A filter needs the posteriors of all rows, in order. With a filter, the function supplies the stored ones. Without a
+    filter, the function is not used.
     """
 
     @property

@@ -267,7 +267,10 @@ class Question:
                         )
 
     def network(self) -> NetworkModel:
-        """Return the network that a BM2 samples, or raise a ModelError. `prior_select` is one of its known symbols."""
+        """Return the network that a BM2 samples, or raise a ModelError.
+
+        In the network, `prior_select` is a known symbol.
+        """
         joint = self.joint
         return network_model(
             joint.name, joint.factors, joint.symbols, self.searched, self.observed, self.given

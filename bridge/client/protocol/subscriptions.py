@@ -271,7 +271,10 @@ class Subscriptions:
         return bool(waiting)
 
     def silent(self) -> list[str]:
-        """Return the topics that are subscribed to by type and have sent no message on this connection."""
+        """Return the topics without a message on this connection whose subscription names the type.
+
+        Topics that were left out are not included.
+        """
         return [
             s.topic
             for s in self._subscribed.values()
