@@ -404,9 +404,10 @@ def cde_table(factor: npt.NDArray[np.float64], prob_bits: int) -> npt.NDArray[np
     The factor is float64[cardinalities of the variables]. For n bits, the result is uint16[n * 2**(n - 1)]. Each entry
     expresses the odds of one bit. The odds are the value of the factor for bit = 1, divided by its value for bit = 0.
 
-    The bits of a variable can form numbers from its cardinality up to the next power of two. These numbers stand for
-    no value. If a bit decides between a value and such a number, the odds favour the value as far as an entry can. If
-    the bit decides between two such numbers, or if another variable has such a number, the odds are 1.
+    If the cardinality of a variable is not a power of two, its bits can also form unused numbers. For example, a
+    variable with the values 0 to 2 has two bits, which can also form the unused number 3. If a bit decides between a
+    value and an unused number, the odds favour the value as far as an entry can express. If the bit decides between two
+    unused numbers, or if another variable of the factor has an unused number, the odds are 1.
     """
     # NaN at unused codes: what is computed with one is NaN, too
     padded = np.full([1 << (cardinality - 1).bit_length() for cardinality in factor.shape], np.nan)

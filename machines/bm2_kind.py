@@ -263,9 +263,9 @@ def kernels_of(machines: Sequence[BM2Machine]) -> list[BM2Kernel]:
 
 
 def run_batches(kernels: Sequence[BM2Kernel], frame: FrameInput) -> list[BoardResult]:
-    """Run a frame on the kernels of all boards. Raises a StartError if the frame does not fit.
+    """Run a frame on the kernels from `kernels_of`, one for each board. Raises a StartError if the frame does not fit.
 
-    The samples are drawn in the same batches as on boards that do not stream samples.
+    Each kernel draws its samples in up to `BATCHES` batches, like a board that does not stream its samples.
     """
     starts, settings = _OnHost([kernel.machine for kernel in kernels]).starts(frame)
     first, *others = _batch_ends(settings.target_count)

@@ -72,11 +72,11 @@ _STAGES: Final[tuple[_Stage, ...]] = (
 
 
 def stage_shares(instances: Iterable[Instance]) -> tuple[StageShare, ...]:
-    """Return the stages in order, computed from the frames with a posterior.
+    """Return the stages in order, with their mean times over the frames that have a posterior.
 
-    A stage is left out if its time is unknown in all of these frames.
-    This process measures `rosbridge out`, from the sending of a result to its arrival. `/bm/frame` reports all
-    other stages.
+    A stage is left out if its time is unknown in all frames with a posterior. The stage `rosbridge out` lasts from the
+    sending of a posterior until the posterior arrives in this process. The times of all other stages come from
+    `/bm/frame`.
     """
     return _shares(instances, _STAGES)
 

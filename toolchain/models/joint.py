@@ -269,7 +269,7 @@ class Question:
     def network(self) -> NetworkModel:
         """Return the network that a BM2 samples, or raise a ModelError.
 
-        In the network, `prior_select` is a known symbol.
+        A BM2 cannot select a prior. The network therefore treats the symbol `prior_select` like the known symbols.
         """
         joint = self.joint
         return network_model(

@@ -271,9 +271,9 @@ class Subscriptions:
         return bool(waiting)
 
     def silent(self) -> list[str]:
-        """Return the topics without a message on this connection whose subscription names the type.
+        """Return the topics that were subscribed to with a type, and that have had no message on this connection.
 
-        Topics that were left out are not included.
+        Topics that were passed to `leave_out` are not returned.
         """
         return [
             s.topic
