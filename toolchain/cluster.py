@@ -147,7 +147,10 @@ def _check_certificates(files: dict[str, Path | None]) -> None:
 
 @contextmanager
 def runner(options: SchedulerOptions) -> Iterator[Run]:
-    """Yield a function that does pieces of work where the options say. If that is impossible, raise a ClusterError."""
+    """Yield a function that does pieces of work in this process, or on the scheduler in `options`.
+
+    Raises a ClusterError if dask is not installed, or if local workers cannot start.
+    """
     address = options.scheduler
     if address is None:
         yield in_this_process

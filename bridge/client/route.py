@@ -103,7 +103,10 @@ def _tls(uri: WebSocketURI, ca_file: Path | None, tls: ssl.SSLContext | None) ->
 
 
 async def connect_along(route: Route, uri: WebSocketURI, factory: Callable[[], _ConnectionT]) -> _ConnectionT:
-    """Connect to the first address of the host that accepts. If no address accepts, raise the OSError of the last."""
+    """Connect to the first address of the host that accepts.
+
+    Raises an error of TLS at once. If no address accepts, raises the OSError of the last address.
+    """
     loop = asyncio.get_running_loop()
     # not by `create_connection`, in which uvloop reports a look-up that fails after the attempt has timed out
     found: list[Any] = await loop.getaddrinfo(uri.host, uri.port, type=SOCK_STREAM)

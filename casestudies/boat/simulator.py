@@ -1,7 +1,10 @@
 """Simulator instead of Gazebo. A boat sails by itself, or a user drives or drags it. Its readings are published.
 
-/cmd_vel ───────────────────────────▶ Boat ─▶ /boat/true_pose, /boat/imu, /boat/raw at each step
-/boat/set_pose, services /boat/... ─▶                                           and at once after a new pose or a call
+    /cmd_vel ────────────┐
+    /boat/set_pose ──────┼─▶ Boat ─▶ /boat/true_pose, /boat/imu, /boat/raw
+    services /boat/... ──┘
+
+The boat publishes at each step, and also at once after a new pose or a call of a service.
 """
 
 import asyncio
@@ -65,7 +68,10 @@ SWITCHES: Final = {
     },
     **{f"{name}/plugged": (f"{name} is plugged in", f"{name} is unplugged") for name in SENSOR_NAMES},
 }
-"""The switches by name, each with a sentence for on and for off. Switches are services below `/boat/`, at first on."""
+"""The switches by name, each with a sentence for on and for off.
+
+A switch is a service `/boat/NAME`. At the start, all switches are on.
+"""
 _SWITCH_TYPE = "std_srvs/SetBool"
 _SHORE = 2.0  # waypoints are at least this far from the map's edge
 # Minimum number of seconds before a change causes another reading: a mouse moves 1000 times a second.
