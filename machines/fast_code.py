@@ -84,7 +84,7 @@ def store_of_codes(occurring: npt.NDArray[np.bool_], slots: int) -> _Store:
 
 
 def store_of_frame(occurring: npt.NDArray[np.bool_], cells: int, slots: int) -> _Store:
-    """Allocate a store whose rows are assigned anew in every frame, to the codes that the frame uses.
+    """Allocate a store whose rows get new codes in every frame: the codes that the frame uses.
 
     A row holds the words of one code of a column. `cells` is the number of cells of all replicas. A frame uses at most
     one code per cell, so the store needs at most `cells` rows. If fewer codes may occur, it has one row per such code.

@@ -20,7 +20,7 @@ SHARED_BITS: Final = {
     "BM1": "means are correct, but the variance of counts is up to 2.6 times as large",
     "BM2": "this biases all samples",
 }
-"""How a machine is affected if consecutive random numbers share bits, by kind of machine.
+"""What happens in a machine if consecutive random numbers share bits, by kind of machine.
 
 Each text is the last part of a sentence in a report or a finding.
 """
